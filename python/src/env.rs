@@ -3,15 +3,14 @@
 use crate::arrays;
 use crate::data::process;
 use crate::errors::to_py_err;
+use crate::snapshots;
 use crate::world::{factors, reset_options, stack};
 use numpy::PyReadonlyArray1;
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use swm::core::{
-    Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Origin, Schema, Snapshot, limits, thread_budget,
-};
+use swm::core::{Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Origin, Schema, limits, thread_budget};
 
 /// A single native environment.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -151,13 +150,13 @@ impl NativeEnv {
 
     /// Returns the full state, including the environment's random state.
     fn snapshot<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
-        PyBytes::new(py, &self.lock().env.snapshot().0)
+        PyBytes::new(py, &snapshots::seal(self.lock().env.snapshot()))
     }
 
     /// Restores a snapshot and returns the info columns.
     fn restore<'py>(&self, py: Python<'py>, state: Vec<u8>) -> PyResult<Bound<'py, PyDict>> {
         let mut this = self.lock();
-        this.env.restore(&Snapshot(state)).map_err(to_py_err)?;
+        this.env.restore(&snapshots::unseal(state)?).map_err(to_py_err)?;
         this.observe(py)
     }
 

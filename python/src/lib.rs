@@ -25,6 +25,7 @@ mod model;
 mod objects;
 mod observer;
 mod policy;
+mod snapshots;
 mod solver;
 mod study;
 mod training;

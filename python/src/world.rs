@@ -6,18 +6,19 @@ use crate::data::process::Owned;
 use crate::errors::{control, from_py_err, json, signal_poll, to_py_err};
 use crate::gym::{InProcess, is_in_call};
 use crate::policy::Actor;
+use crate::snapshots;
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
-use swm::collect_target;
+use swm::collect_target::{self, Existing};
 use swm::core::columns::{TERMINATED, TRUNCATED};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
 use swm::core::run::Control;
-use swm::core::{Callable, CameraView, Env, Error, Key, Manifest, Origin, ResetOptions, Snapshot, VariationRequest};
+use swm::core::{Callable, CameraView, Env, Error, Key, Manifest, Origin, ResetOptions, VariationRequest};
 use swm::data::{ImageCodec, Location, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm::eval::{CollectConfig, EvalConfig, PolicyChoice, Starts, Videos, WorldConfig, episode_key, reset_seed};
@@ -271,14 +272,14 @@ impl World {
 
     /// The full state of a slot's environment.
     fn snapshot<'py>(&self, py: Python<'py>, slot: usize) -> PyResult<Bound<'py, PyBytes>> {
-        Ok(PyBytes::new(py, &self.lock()?.pool().env(slot).snapshot().0))
+        Ok(PyBytes::new(py, &snapshots::seal(self.lock()?.pool().env(slot).snapshot())))
     }
 
     /// Restores a snapshot in a slot.
     fn restore(&self, py: Python<'_>, slot: usize, state: Vec<u8>) -> PyResult<()> {
         let mut world = self.lock_to_run()?;
         let world = &mut *world;
-        let snapshot = Snapshot(state);
+        let snapshot = snapshots::unseal(state)?;
         py.detach(|| world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(to_py_err)
     }
 
@@ -321,9 +322,10 @@ impl World {
             manifest.config["codec"] = serde_json::json!(codec);
             manifest.config["wrappers"] = settings.wrappers;
             let schema = world.collect_schema(&config)?;
-            let create = |location: &Location, mode, manifest| {
+            let create = |location: &Location, mode, manifest, continues| {
                 let manifest = Some(manifest);
-                let options = WriteOptions { mode, codec, manifest, exclusive: true, ..WriteOptions::default() };
+                let options =
+                    WriteOptions { mode, codec, manifest, exclusive: true, continues, ..WriteOptions::default() };
                 match &format {
                     Some(format) => swm::data::FORMATS.get(format)?.create(location, &schema, options),
                     None => swm::data::create(location.clone(), &schema, options),
@@ -333,19 +335,19 @@ impl World {
                 Some(_) => None,
                 None => Some(swm::home::target(&path.unwrap_or_default(), format.as_deref())?),
             };
-            if let Some(location) = &location {
-                manifest.not_finite = collect_target::check(location, mode, &manifest, false, EXISTS)?;
-            }
+            let existing = location.as_ref().map(|to| collect_target::check(to, mode, &manifest, false, EXISTS));
+            let Existing { continues, not_finite } = existing.transpose()?.unwrap_or_default();
+            manifest.not_finite = not_finite;
             let writer: Box<dyn swm::data::Writer> = match (writer, &location) {
                 (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),
-                (None, Some(location)) => create(location, mode, manifest.clone())?,
+                (None, Some(location)) => create(location, mode, manifest.clone(), continues)?,
                 (None, None) => return Err(Error::config("World.collect", "no target is given", "give a path")),
             };
             let collected = world.collect(policy, writer, &config, &mut control(progress));
             let warning = collect_target::describe_not_finite(world.not_finite());
             if let (Some(_), Some(location)) = (&warning, &location) {
                 collect_target::add_not_finite(&mut manifest, world.not_finite());
-                create(location, WriteMode::Append, manifest)?.finish()?;
+                create(location, WriteMode::Append, manifest, None)?.finish()?;
             }
             Ok((collected?, warning))
         });
@@ -382,8 +384,14 @@ impl World {
                 }
                 None => Starts::episodic(settings.episodes, settings.seed, settings.variation)?,
             };
-            let videos =
-                settings.videos.map(|(root, prefix, count)| Videos { root, prefix, count, fps: 15, frame_strip: None });
+            let videos = settings.videos.map(|(root, prefix, count)| Videos {
+                root,
+                prefix,
+                count,
+                fps: 15,
+                frame_strip: None,
+                staged: false,
+            });
             let config = EvalConfig {
                 policy: settings.policy,
                 condition: settings.condition,

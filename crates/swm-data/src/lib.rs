@@ -13,8 +13,8 @@ pub mod hub;
 pub mod tools;
 
 pub use dataset::{
-    BatchSlice, CacheConfig, ClipSpec, Clips, ColumnStats, CommitPolicy, Constants, Episode, Epoch, GoalMixture,
-    GoalSpec, Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Mark, Part, Reader, ReplayBuffer,
+    BatchSlice, CacheConfig, ClipSpec, Clips, ColumnStats, CommitPolicy, Constants, Continued, Episode, Epoch,
+    GoalMixture, GoalSpec, Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Mark, Part, Reader, ReplayBuffer,
     ReplayConfig, ReplayLoader, Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats,
     goals, objects, views,
 };

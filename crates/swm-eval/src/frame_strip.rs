@@ -26,7 +26,7 @@ pub fn frame_strip(
     }
     let folder = tempfile::tempdir().map_err(|source| Error::io(std::env::temp_dir(), "creating a folder", source))?;
     let videos = Some((folder.path().to_owned(), 1));
-    let options = RunOptions { videos, frame_strip: Some(frames.max(2)), ..options.clone() };
+    let options = RunOptions { videos, frame_strip: Some(frames.max(2)), staged: false, ..options.clone() };
     let results = request.run_episodes(Episodes::Only(&[episode]), resolver, &options, control)?;
     let file = results.runs.last().and_then(|run| run.videos.first());
     file.map(|file| files::read(&folder.path().join(file), MAX_BYTES)).transpose()

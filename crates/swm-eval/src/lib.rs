@@ -51,5 +51,5 @@ pub use runner::{PROBE_DATASET, ResolvedPolicy, Resolver, RunOptions};
 pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
 pub use study::{AnyStudy, Cell, Common, Measured, Study, StudyFolder, TableCell, TableStudy};
-pub use video_recording::Videos;
+pub use video_recording::{STAGED, Videos, publish};
 pub use world::{World, WorldConfig};

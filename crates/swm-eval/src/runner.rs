@@ -119,6 +119,8 @@ pub struct RunOptions {
     pub videos: Option<(PathBuf, usize)>,
     /// Frame strips of this many frames instead of videos ([`frame_strip`](crate::frame_strip())).
     pub frame_strip: Option<usize>,
+    /// Videos wait for [`publish`](crate::publish) before they replace those of older results.
+    pub staged: bool,
 }
 
 impl EvalRequest {
@@ -264,6 +266,7 @@ impl EvalRequest {
                 count: *count,
                 fps: 15,
                 frame_strip: options.frame_strip,
+                staged: options.staged,
             }),
         }
     }

@@ -3,7 +3,7 @@
 use crate::frame_strip::side_by_side;
 use std::path::{Path, PathBuf};
 use swm_core::columns::{GOAL, PIXELS};
-use swm_core::{EnvPool, Error, Result};
+use swm_core::{EnvPool, Error, Result, files};
 
 /// Options of the videos of the first episodes. A video has the frame of the agent on the left and the frame of the
 /// goal on the right. Its poster, the first frame as a PNG file, is beside it.
@@ -19,6 +19,38 @@ pub struct Videos {
     pub fps: u32,
     /// Write a frame strip of this many frames, `*.png`, instead of a video.
     pub frame_strip: Option<usize>,
+    /// Write the files below [`STAGED`] in `root`, from where [`publish`] moves them: those of older results stay until then.
+    pub staged: bool,
+}
+
+/// The folder of files that are written and do not have their place yet.
+pub const STAGED: &str = ".new";
+
+/// Moves staged videos and their posters to their places; `names` are relative to the root, as results state them.
+///
+/// # Errors
+/// When a file cannot be moved.
+pub fn publish<'a>(root: &Path, names: impl IntoIterator<Item = &'a String>) -> Result<()> {
+    let staged = root.join(STAGED);
+    let mut folder = None;
+    for name in names {
+        let poster = Path::new(name).with_extension("png");
+        for name in [Path::new(name), &poster] {
+            let (from, to) = (staged.join(name), root.join(name));
+            if !from.exists() {
+                continue;
+            }
+            let parent = to.parent().unwrap_or(root);
+            let moved = std::fs::create_dir_all(parent).and_then(|()| std::fs::rename(&from, &to));
+            moved.map_err(|source| Error::io(&to, "replacing a video", source))?;
+            folder = from.parent().map(Path::to_owned);
+        }
+    }
+    if let Some(folder) = folder {
+        files::remove_empty_folder(&folder)?;
+        files::remove_empty_folder(&staged)?;
+    }
+    Ok(())
 }
 
 impl Videos {
@@ -30,6 +62,12 @@ impl Videos {
     /// The path of the poster of a video.
     fn poster(&self, index: usize) -> PathBuf {
         self.root.join(self.name(index)).with_extension("png")
+    }
+
+    /// Where the file of a video is written.
+    fn written(&self, index: usize) -> PathBuf {
+        let root = if self.staged { self.root.join(STAGED) } else { self.root.clone() };
+        root.join(self.name(index))
     }
 }
 
@@ -140,20 +178,19 @@ impl VideoRecording {
         for (i, &episode) in counted.iter().enumerate() {
             let Some(Frames { frames, .. }) = self.frames.get(episode) else { continue };
             let name = self.videos.name(i);
-            let path = self.videos.root.join(&name);
+            let path = self.videos.written(i);
+            let poster = path.with_extension("png");
             let folder = path.parent().unwrap_or(Path::new("."));
             let made = std::fs::create_dir_all(folder)
                 .map_err(|source| Error::io(folder, "creating the folder of videos", source))
                 .and_then(|()| {
                     if let Some(count) = self.videos.frame_strip {
                         let image = side_by_side(frames, self.size, count);
-                        return swm_data::write_png(&self.videos.poster(i), (count + 1) * width, height, &image);
+                        return swm_data::write_png(&poster, (count + 1) * width, height, &image);
                     }
                     let slices = frames.iter().map(Vec::as_slice);
                     swm_data::write_mp4_scaled(&path, 2 * width, height, self.videos.fps, scale, slices)?;
-                    frames
-                        .first()
-                        .map_or(Ok(()), |first| swm_data::write_png(&self.videos.poster(i), 2 * width, height, first))
+                    frames.first().map_or(Ok(()), |first| swm_data::write_png(&poster, 2 * width, height, first))
                 });
             match made {
                 Ok(()) if self.videos.frame_strip.is_some() => written.push(name.replace(".mp4", ".png")),

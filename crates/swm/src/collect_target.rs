@@ -3,12 +3,11 @@
 use std::collections::BTreeMap;
 use swm_core::{Error, Manifest, Result};
 use swm_data::lance::{Shard, shard_manifest, shard_manifests};
-use swm_data::{Location, WriteMode};
+use swm_data::{Continued, Location, WriteMode};
 use swm_eval::continuation::check_continues;
 
 /// Checks, before any episode is played, that a collection with this manifest may be written to a location.
-/// `mix_renderers` permits frames of another renderer than the renderer of the stored frames. Returns the numbers of NaN
-/// and infinite values of the episodes that remain in the dataset, by column. `advice` says, in the caller's words, what to
+/// `mix_renderers` permits frames of another renderer than the renderer of the stored frames. `advice` says, in the caller's words, what to
 /// do about a dataset that exists.
 ///
 /// # Errors
@@ -19,23 +18,34 @@ pub fn check(
     new: &Manifest,
     mix_renderers: bool,
     advice: &str,
-) -> Result<BTreeMap<String, u64>> {
+) -> Result<Existing> {
     if !exists(location) {
-        return Ok(BTreeMap::new());
+        return Ok(Existing::default());
     }
     match mode {
-        WriteMode::Overwrite => Ok(BTreeMap::new()),
+        WriteMode::Overwrite => Ok(Existing::default()),
         WriteMode::Append => {
-            let Some(mut stored) = swm_data::open(location.clone())?.manifest() else { return Ok(BTreeMap::new()) };
+            let reader = swm_data::open(location.clone())?;
+            let continues = Some(Continued::of(&*reader)?);
+            let Some(mut stored) = reader.manifest() else { return Ok(Existing { continues, ..Existing::default() }) };
             let not_finite = std::mem::take(&mut stored.not_finite);
             check_continues(&stored, new)?;
             if !mix_renderers {
                 check_renderer("continuing a collection", &stored, new)?;
             }
-            Ok(not_finite)
+            Ok(Existing { continues, not_finite })
         }
-        WriteMode::Create => check_new(location, advice).map(|()| BTreeMap::new()),
+        WriteMode::Create => check_new(location, advice).map(|()| Existing::default()),
     }
+}
+
+/// What remains of an existing dataset, to which a collection adds episodes.
+#[derive(Default)]
+pub struct Existing {
+    /// Its episodes, for [`swm_data::WriteOptions::continues`].
+    pub continues: Option<Continued>,
+    /// The numbers of its NaN and infinite values, by column.
+    pub not_finite: BTreeMap<String, u64>,
 }
 
 /// Checks that a location has no dataset. `advice` says what to do about one.

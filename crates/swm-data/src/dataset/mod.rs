@@ -30,5 +30,5 @@ pub use reader::{Constants, Episode, Irregularity, Reader, StepRange};
 pub use replay::{ReplayBuffer, ReplayConfig, ReplayLoader};
 pub use split::{Part, Split};
 pub use stats::{ColumnStats, column_quantiles, column_stats};
-pub use writer::{CommitPolicy, WriteMode, WriteOptions, Writer};
+pub use writer::{CommitPolicy, Continued, WriteMode, WriteOptions, Writer};
 pub(crate) use writer::{is_full, with_stored};

@@ -1,6 +1,7 @@
 //! The contract for storing episodes: [`Writer`] and its options.
 
-use super::reader::Constants;
+use super::reader::{Constants, Reader};
+use std::fmt::Display;
 use std::time::Duration;
 use swm_core::{Batch, Error, Manifest, Result};
 use swm_image::ImageCodec;
@@ -52,6 +53,39 @@ pub struct WriteOptions {
     /// continue the same dataset would store the same episodes twice. Formats other than Lance, and writers that replace
     /// a dataset, have one writer anyway.
     pub exclusive: bool,
+    /// What the caller read of the dataset that it continues. A writer that finds another dataset, which replaced that one before
+    /// the writer had the lock, changes nothing and fails. Shards ignore it.
+    pub continues: Option<Continued>,
+}
+
+/// The episodes of a dataset that a caller read before it appends to them.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Continued {
+    episodes: usize,
+    identity: String,
+}
+
+impl Continued {
+    /// Returns what tells the episodes of a dataset from those of another one.
+    ///
+    /// # Errors
+    /// If the dataset is damaged.
+    pub fn of(reader: &dyn Reader) -> Result<Self> {
+        let episodes = reader.episodes().len();
+        Ok(Self { episodes, identity: reader.identity(episodes)? })
+    }
+
+    /// Checks that a dataset has these episodes. `label` names it in the error.
+    ///
+    /// # Errors
+    /// If it was replaced by another dataset, or is damaged.
+    pub fn check(&self, reader: &dyn Reader, label: &dyn Display) -> Result<()> {
+        if reader.episodes().len() < self.episodes || reader.identity(self.episodes)? != self.identity {
+            let problem = "another program replaced it while it was to be continued; nothing was added to it";
+            return Err(Error::config(format!("dataset {label}"), problem, "run the command again"));
+        }
+        Ok(())
+    }
 }
 
 /// Whether an error means that the disk, a quota or the largest possible file is full.

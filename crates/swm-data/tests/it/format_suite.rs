@@ -17,7 +17,14 @@ const GROUP: usize = 2;
 
 pub fn writer(location: impl Into<Location>, mode: WriteMode) -> Result<Box<dyn Writer>> {
     let commit = CommitPolicy { episodes: GROUP, ..CommitPolicy::default() };
-    let options = WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit, exclusive: false };
+    let options = WriteOptions {
+        mode,
+        codec: ImageCodec::Png,
+        manifest: Some(manifest(3)),
+        commit,
+        exclusive: false,
+        continues: None,
+    };
     create(location, &schema(), options)
 }
 

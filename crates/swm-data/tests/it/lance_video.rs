@@ -13,7 +13,7 @@ use swm_data::{CommitPolicy, Constants, ImageCodec, WriteMode, WriteOptions, cre
 
 fn write(path: &std::path::Path, mode: WriteMode, codec: ImageCodec, episodes: std::ops::Range<usize>) {
     let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
-    let options = WriteOptions { mode, codec, manifest: Some(manifest(3)), commit, exclusive: false };
+    let options = WriteOptions { mode, codec, manifest: Some(manifest(3)), commit, exclusive: false, continues: None };
     let mut writer = create(path, &schema(), options).expect("creating the dataset");
     for e in episodes {
         let constants = Constants::from([("scene.xml".to_owned(), format!("<{e}/>").into_bytes())]);

@@ -1,10 +1,12 @@
 //! Two writers of one dataset: exclusive writers refuse each other, so that two continued collections cannot store the
 //! same episodes twice.
 
-use crate::sample::{check, episode, options, schema, write};
+use crate::sample::{check, episode, manifest, options, schema, write};
 use swm_core::run::Control;
 use swm_data::lance::{Shard, create_shard};
-use swm_data::{CommitPolicy, ConvertMode, ConvertOptions, Location, WriteMode, WriteOptions, convert, create, open};
+use swm_data::{
+    CommitPolicy, Continued, ConvertMode, ConvertOptions, Location, WriteMode, WriteOptions, convert, create, open,
+};
 
 fn exclusive(mode: WriteMode) -> WriteOptions {
     let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
@@ -27,6 +29,48 @@ fn second_collection_into_a_dataset_is_refused() {
         let reader = open(&path).expect("opening");
         assert_eq!(reader.episodes().len(), 3, "{format}");
         check(&*reader, 0);
+    }
+}
+
+/// A writer waits for the lock of one that replaces the dataset whose episodes the caller has read.
+#[test]
+fn a_dataset_that_was_replaced_is_not_continued() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "folder", "video", "h5", "lerobot"] {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..2);
+        let continues = Some(Continued::of(&*open(&path).expect("opening")).expect("an identity"));
+        let append = || WriteOptions { continues: continues.clone(), ..exclusive(WriteMode::Append) };
+        create(&path, &schema(), append()).expect("continuing").finish().expect("finishing");
+        let mut other = options(WriteMode::Overwrite);
+        other.manifest = Some(manifest(9));
+        let mut replacing = create(&path, &schema(), other).expect("replacing");
+        (5..7).for_each(|e| replacing.write_episode(&episode(e)).expect("writing"));
+        replacing.finish().expect("finishing");
+        let error = create(&path, &schema(), append()).err().expect("another dataset");
+        assert!(error.is_usage() && error.to_string().contains("another program replaced it"), "{format}: {error}");
+        let reader = open(&path).expect("opening");
+        assert_eq!((reader.episodes().len(), reader.manifest().map(|found| found.seed)), (2, Some(9)), "{format}");
+        check(&*reader, 5);
+    }
+}
+
+#[test]
+fn a_file_that_is_moved_while_it_is_written_is_an_error() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let (path, moved) = (folder.path().join("data.h5"), folder.path().join("moved.h5"));
+    for is_copied_back in [false, true] {
+        write(&path, WriteMode::Overwrite, 1, 0..2);
+        let mut writer = create(&path, &schema(), exclusive(WriteMode::Append)).expect("continuing");
+        std::fs::rename(&path, &moved).expect("moving");
+        if is_copied_back {
+            std::fs::copy(&moved, &path).expect("copying");
+        }
+        writer.write_episode(&episode(2)).expect("writing");
+        let error = writer.finish().expect_err("a moved file").to_string();
+        assert!(error.contains("moved, deleted or replaced"), "{error}");
+        assert_eq!(open(&moved).expect("opening").episodes().len(), 3);
+        std::fs::remove_file(&moved).expect("deleting");
     }
 }
 

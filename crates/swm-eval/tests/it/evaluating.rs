@@ -6,7 +6,7 @@ use swm_core::results::{Counting, Run};
 use swm_core::run::Control;
 use swm_core::{Batch, Candidates, CostModel, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
 use swm_data::Reader as _;
-use swm_eval::{CollectConfig, EvalConfig, Starts, Videos, World, WorldConfig};
+use swm_eval::{CollectConfig, EvalConfig, STAGED, Starts, Videos, World, WorldConfig, publish};
 use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy};
 
 pub fn world(envs: usize, threads: usize) -> World {
@@ -253,7 +253,8 @@ fn errors_name_invalid_requests() {
     let error = Starts::choose(&reader, 1000, 2, 0).expect_err("too many starts").to_string();
     assert!(error.contains("1000") && error.contains("collect more"), "{error}");
     let no_frames = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
-    let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10, frame_strip: None };
+    let videos =
+        Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10, frame_strip: None, staged: false };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
     let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("creating the starts");
     let mut world = World::new(&ENTRY, no_frames).expect("creating the world");
@@ -271,11 +272,24 @@ fn videos_of_the_first_episodes_are_written() {
         count: 2,
         fps: 10,
         frame_strip: None,
+        staged: false,
     };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
     let starts = Starts::episodic(4, 2, VariationRequest::default()).expect("creating the starts");
     let found =
         world(3, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect("the evaluation succeeds");
     assert_eq!(found.videos, ["videos/walker-0.mp4", "videos/walker-1.mp4"]);
-    assert!(found.videos.iter().all(|video| folder.path().join(video).metadata().is_ok_and(|file| file.len() > 500)));
+    let read = |name: &String| std::fs::read(folder.path().join(name)).expect("a video");
+    let written: Vec<Vec<u8>> = found.videos.iter().map(read).collect();
+    assert!(written.iter().all(|video| video.len() > 500));
+
+    // Staged videos replace these when they are published, with their posters.
+    let staged = Videos { staged: true, count: 1, fps: 20, ..config.videos.clone().expect("videos") };
+    let config = EvalConfig { videos: Some(staged), ..EvalConfig::default() };
+    let again =
+        world(3, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect("the evaluation succeeds");
+    assert_eq!((again.videos.clone(), read(&again.videos[0]) == written[0]), (found.videos[..1].to_vec(), true));
+    publish(folder.path(), &again.videos).expect("moving the files");
+    assert!(read(&again.videos[0]) != written[0] && read(&found.videos[1]) == written[1]);
+    assert!(!folder.path().join(STAGED).exists());
 }

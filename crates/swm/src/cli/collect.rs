@@ -5,6 +5,7 @@ mod recorded;
 use super::config::{CodecArgs, VariationArgs, count, image_size};
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json, eprint, progress};
+use crate::collect_target::Existing;
 use crate::resolver::policy_of_choice;
 use crate::{collect_target, home};
 use clap::Args;
@@ -13,7 +14,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 use swm_core::{CameraView, EnvChoice, Error, Key, Manifest, Origin, Policy, Result, Schema, limits};
 use swm_data::lance::{Shard, create_shard};
-use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
+use swm_data::{Continued, FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, PolicyChoice, World, WorldConfig};
 
 /// Arguments of `swm collect`.
@@ -225,12 +226,15 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let (mut world, mut policy, weights) = collection.prepare()?;
     swm_data::recover(location)?;
     let mut manifest = collection.manifest(&world, weights)?;
-    manifest.not_finite = match (collection.shard, collection.mode) {
+    let Existing { continues, not_finite } = match (collection.shard, collection.mode) {
         (None, mode) => collect_target::check(location, mode, &manifest, collection.mix_renderers, EXISTS)?,
-        (Some(shard), WriteMode::Append) => collect_target::not_finite_of_shard(location, shard)?,
-        (Some(_), _) => BTreeMap::new(),
+        (Some(shard), WriteMode::Append) => {
+            Existing { not_finite: collect_target::not_finite_of_shard(location, shard)?, ..Existing::default() }
+        }
+        (Some(_), _) => Existing::default(),
     };
-    let writer = collection.writer(&world.collect_schema(config)?, collection.mode, manifest.clone())?;
+    manifest.not_finite = not_finite;
+    let writer = collection.writer(&world.collect_schema(config)?, collection.mode, manifest.clone(), continues)?;
     let episodes = collection.shard.map_or(0..config.episodes, |shard| shard.episodes(config.episodes));
     let config = &CollectConfig { episodes: episodes.len(), first: episodes.start, ..config.clone() };
     let start = Instant::now();
@@ -238,7 +242,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     if let Some(warning) = collect_target::describe_not_finite(world.not_finite()) {
         eprint(&format!("warning: {warning}\n"));
         collect_target::add_not_finite(&mut manifest, world.not_finite());
-        let writer = collection.writer(&world.collect_schema(config)?, WriteMode::Append, manifest)?;
+        let writer = collection.writer(&world.collect_schema(config)?, WriteMode::Append, manifest, None)?;
         if collected.is_ok() { writer.finish()? } else { writer.pause()? }
     }
     let collected = collected?;
@@ -280,9 +284,15 @@ impl Collection<'_> {
         Ok(manifest)
     }
 
-    fn writer(&self, schema: &Schema, mode: WriteMode, manifest: Manifest) -> Result<Box<dyn Writer>> {
+    fn writer(
+        &self,
+        schema: &Schema,
+        mode: WriteMode,
+        manifest: Manifest,
+        continues: Option<Continued>,
+    ) -> Result<Box<dyn Writer>> {
         let (codec, manifest) = (self.codec, Some(manifest));
-        let options = WriteOptions { mode, codec, manifest, exclusive: true, ..WriteOptions::default() };
+        let options = WriteOptions { mode, codec, manifest, exclusive: true, continues, ..WriteOptions::default() };
         match (self.shard, self.format) {
             (Some(shard), _) => create_shard(self.location, schema, options, shard),
             (None, Some(format)) => FORMATS.get(format)?.create(self.location, schema, options),

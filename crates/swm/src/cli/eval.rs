@@ -18,7 +18,7 @@ use swm_core::limits::{ENVS, EVALUATED_EPISODES, STEPS};
 use swm_core::results::{Counting, Until};
 use swm_core::{EnvChoice, Error, Key, Origin, Result, Results, files};
 use swm_data::{Part, Split};
-use swm_eval::{Condition, EvalRequest, HeldOut, PolicyKind, RunOptions, StartsRequest};
+use swm_eval::{Condition, EvalRequest, HeldOut, PolicyKind, RunOptions, StartsRequest, publish};
 
 /// Arguments of `swm eval`.
 #[derive(Args)]
@@ -346,12 +346,15 @@ pub fn run(
     run_record::check(output)?;
     eval_until::refuse_fixed(output)?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
-    let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context));
+    // Older results keep their videos until there are new results.
+    let options = RunOptions { staged: true, ..run_options(envs, videos, context) };
+    let results = request.run(resolver, &options, &mut control(context));
     if results.is_err() && is_new {
         files::remove_empty_folder(output)?;
     }
     let results = results?;
     let file = output.join("results.json");
+    publish(output, results.runs.iter().flat_map(|run| &run.videos))?;
     write_json(&file, &results)?;
     run_record::write(output, false)?;
     Ok((results, file))
@@ -360,7 +363,7 @@ pub fn run(
 /// Returns the options that do not change results; `videos` is a folder, and the number of recorded episodes of each
 /// run.
 pub fn run_options(envs: usize, videos: Option<(PathBuf, usize)>, context: &Context) -> RunOptions {
-    RunOptions { envs, threads: context.threads, videos, frame_strip: None }
+    RunOptions { envs, threads: context.threads, videos, frame_strip: None, staged: false }
 }
 
 /// Writes indented JSON to a file.

@@ -3,9 +3,10 @@
 use super::run_record;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
+use swm_eval::STAGED;
 
 /// Creates the folder that a command writes these files to, and keeps other writers away until the lock is dropped. A
 /// command calls this before its work, so that hours of it are not lost because its results cannot be written. Deletes what a
@@ -46,11 +47,21 @@ pub fn claim_file(file: &Path) -> Result<Option<Lock>> {
 /// Deletes what a killed evaluation left of writing its record, its videos and their posters.
 fn delete_temporary_of_evaluation(folder: &Path) -> Result<()> {
     files::delete_temporary(folder, |name| name == run_record::FILE)?;
-    let videos = folder.join("videos");
-    if videos.is_symlink() || !videos.is_dir() {
-        return Ok(());
+    let is_folder = |path: &Path| !path.is_symlink() && path.is_dir();
+    let (videos, staged) = (folder.join("videos"), folder.join(STAGED));
+    if is_folder(&videos) {
+        files::delete_temporary(&videos, is_video)?;
     }
-    files::delete_temporary(&videos, is_video)
+    let staged_videos = staged.join("videos");
+    if is_folder(&staged) && is_folder(&staged_videos) {
+        files::delete_temporary(&staged_videos, is_video)?;
+        let is_own = |name: &PathBuf| name.to_str().is_some_and(|name| !name.contains('/') && is_video(name));
+        let names = files::list(&staged_videos)?.into_iter().filter(is_own);
+        files::delete_named(&staged_videos, &names.collect::<Vec<_>>())?;
+        files::remove_empty_folder(&staged_videos)?;
+        files::remove_empty_folder(&staged)?;
+    }
+    Ok(())
 }
 
 /// Returns whether a name is that of a video of an evaluation or of its poster, such as `random-in-distribution-0.mp4`.

@@ -31,7 +31,7 @@ mod removal;
 mod writer;
 
 pub(crate) use images::{ImageFiles, SUFFIXES, image_path, video_path};
-pub(crate) use reader::{ColumnFiles, contains_videos};
+pub(crate) use reader::{ColumnFiles, check_unchanged, contains_videos, state_of};
 pub(crate) use removal::remove;
 pub(crate) use writer::ColumnFilesWriter;
 

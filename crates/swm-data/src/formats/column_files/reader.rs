@@ -9,6 +9,7 @@ use crate::dataset::{Constants, StepRange};
 use crate::formats::opened::Opened;
 use crate::formats::set_aside::COLUMN_FILES;
 use std::collections::BTreeMap;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
@@ -422,5 +423,50 @@ fn integers(npz: &mut Npz, path: &Path) -> Result<Vec<i64>> {
         Some(DType::Int32) => Ok(bytes.as_chunks().0.iter().map(|&b| i64::from(i32::from_ne_bytes(b))).collect()),
         Some(DType::Int64) => Ok(bytes.as_chunks().0.iter().map(|&b| i64::from_ne_bytes(b)).collect()),
         _ => Err(Error::corrupt(path, "it is not a one-dimensional array of integers", "rebuild the dataset")),
+    }
+}
+
+/// What tells whether another program wrote to files: a hash of their sizes, their times and what they are. `each` calls the given
+/// function with every path.
+pub fn state_of(each: impl Fn(&mut dyn FnMut(&Path))) -> blake3::Hash {
+    let mut hasher = blake3::Hasher::new();
+    each(&mut |file| {
+        let Ok(found) = std::fs::metadata(file) else { return };
+        let times = [found.mtime(), found.mtime_nsec(), found.ctime(), found.ctime_nsec()];
+        for number in [found.dev(), found.ino(), found.size()].into_iter().chain(times.map(i64::cast_unsigned)) {
+            hasher.update(&number.to_le_bytes());
+        }
+    });
+    hasher.finalize()
+}
+
+/// Checks that no other program wrote to files since [`state_of`] gave their state.
+///
+/// # Errors
+/// If one did.
+pub fn check_unchanged(folder: &Path, before: blake3::Hash, each: impl Fn(&mut dyn FnMut(&Path))) -> Result<()> {
+    if state_of(each) == before {
+        return Ok(());
+    }
+    let problem = "another program wrote to its files while they were read";
+    Err(Error::corrupt(folder, problem, "run the command again once that program has ended"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_that_another_program_writes_to_are_found() {
+        let folder = tempfile::tempdir().expect("creating a folder");
+        let paths = ["a", "b"].map(|name| folder.path().join(name));
+        paths.iter().for_each(|path| std::fs::write(path, "one").expect("writing"));
+        let each = |visit: &mut dyn FnMut(&Path)| paths.iter().for_each(|path| visit(path));
+        let before = state_of(each);
+        check_unchanged(folder.path(), before, each).expect("unchanged files");
+        std::fs::write(folder.path().join("new"), "two").expect("writing");
+        std::fs::rename(folder.path().join("new"), &paths[1]).expect("replacing");
+        let error = check_unchanged(folder.path(), before, each).expect_err("another file").to_string();
+        assert!(error.contains("another program wrote"), "{error}");
     }
 }

@@ -3,7 +3,7 @@
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash};
 use crate::dataset::{Constants, Episode, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, SUFFIXES, exists, image_path};
+use crate::formats::column_files::{ColumnFiles, SUFFIXES, check_unchanged, exists, image_path, state_of};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -96,7 +96,17 @@ impl Reader for FolderReader {
 
     fn content_hash(&self) -> Result<String> {
         let rows: &EpisodeRows = self.files.rows();
-        content_hash(rows, &self.schema.columns()[2..], |column, add| {
+        let images = |visit: &mut dyn FnMut(&Path)| {
+            for column in self.schema.columns()[2..].iter().filter(|column| column.is_image()) {
+                for (position, episode) in rows.episodes().iter().enumerate() {
+                    for (step, suffix) in (0..episode.length).flat_map(|step| SUFFIXES.map(|suffix| (step, suffix))) {
+                        visit(&image_path(self.files.folder(), &column.name, position, step, suffix));
+                    }
+                }
+            }
+        };
+        let before = state_of(images);
+        let hash = content_hash(rows, &self.schema.columns()[2..], |column, add| {
             let data = if self.files.has(&column.name) { self.files.data(&column.name)? } else { &[] };
             for (position, episode) in rows.episodes().iter().enumerate() {
                 if column.is_image() {
@@ -110,7 +120,10 @@ impl Reader for FolderReader {
                 }
             }
             Ok(())
-        })
+        });
+        self.files.check()?;
+        check_unchanged(self.files.folder(), before, images)?;
+        hash
     }
 }
 

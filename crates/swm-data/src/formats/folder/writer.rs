@@ -14,7 +14,12 @@ use swm_image::ImageCodec;
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("folder")?;
     options.codec.check()?;
-    let known = || Ok(FolderReader::open(folder)?.schema().clone());
+    let continues = options.continues.clone();
+    let known = || {
+        let known = FolderReader::open(folder)?;
+        continues.iter().try_for_each(|continued| continued.check(&known, &folder.display()))?;
+        Ok(known.schema().clone())
+    };
     let (incoming, codec) = (schema.clone(), options.codec);
     let make = move |columns| FolderWriter { columns, schema: incoming, codec };
     ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Images, make, |writer| {

@@ -10,7 +10,7 @@ use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, Reader as _, StepRange, WriteMode, WriteOptions, Writer, with_stored};
 use crate::formats::replacing::ReplacingWriter;
 use std::io;
-use std::os::unix::fs::FileExt as _;
+use std::os::unix::fs::{FileExt as _, MetadataExt as _};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
@@ -53,6 +53,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
         (WriteMode::Append, true) => {
             let old = Lock::file(path)?;
             let reader = reader(&old, path)?;
+            options.continues.iter().try_for_each(|continued| continued.check(&reader, &location))?;
             episodes::check_appendable(&location, schema, reader.schema())?;
             let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
                 Ok(writer) => writer,
@@ -437,6 +438,15 @@ impl Writer for Hdf5Writer {
             return Err(Self::earlier_failure());
         }
         self.close()?;
+        let id = |found: std::fs::Metadata| (found.dev(), found.ino());
+        if std::fs::metadata(&self.path).ok().map(id) != self.file.metadata().ok().map(id) {
+            let problem = "another program moved, deleted or replaced it while episodes were written to it";
+            return Err(Error::corrupt(
+                &self.path,
+                problem,
+                "look for it under another name, or write the episodes again",
+            ));
+        }
         self.take_place()
     }
 }

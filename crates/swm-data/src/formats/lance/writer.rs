@@ -122,6 +122,7 @@ fn prepare(
         }
         (WriteMode::Append, Some(old)) => {
             let known = LanceReader::of(store.clone(), Arc::clone(&old.manifest))?;
+            options.continues.iter().try_for_each(|continued| continued.check(&known, &store.label.display()))?;
             columns = match_table_columns(&store.label, columns, &old, crate::Reader::schema(&known))?;
             episodes = crate::Reader::episodes(&known).len();
             next = known.next_episode();

@@ -137,6 +137,7 @@ impl LerobotWriter {
             let problem = "another program wrote it, and its metadata is not sufficient for appending";
             return Err(Error::corrupt(&self.root, problem, "convert it to a new dataset first"));
         };
+        self.options.continues.iter().try_for_each(|continued| continued.check(&old, &self.root.display()))?;
         episodes::check_appendable(&self.root.display(), &self.schema, old.schema())?;
         self.file = old.files_of_episodes.last().map_or(0, |files| files.file + 1);
         let manifest = self.options.manifest.clone().or(recorded.manifest);

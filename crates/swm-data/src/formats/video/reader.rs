@@ -3,7 +3,7 @@
 use crate::dataset::Location;
 use crate::dataset::episodes::content_hash;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, exists, video_path};
+use crate::formats::column_files::{ColumnFiles, check_unchanged, exists, state_of, video_path};
 use crate::formats::opened;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -100,7 +100,14 @@ impl Reader for VideoReader {
 
     fn content_hash(&self) -> Result<String> {
         let rows = self.files.rows();
-        content_hash(rows, &self.schema.columns()[2..], |column, add| {
+        let videos = |visit: &mut dyn FnMut(&Path)| {
+            for column in self.schema.columns()[2..].iter().filter(|column| !self.files.has(&column.name)) {
+                (0..rows.episodes().len())
+                    .for_each(|position| visit(&video_path(self.files.folder(), &column.name, position)));
+            }
+        };
+        let before = state_of(videos);
+        let hash = content_hash(rows, &self.schema.columns()[2..], |column, add| {
             if !self.files.has(&column.name) {
                 let index = self.schema.index(&column.name)?;
                 for (position, episode) in rows.episodes().iter().enumerate() {
@@ -115,7 +122,10 @@ impl Reader for VideoReader {
                 data[rows.start as usize * size..rows.end as usize * size].chunks_exact(size).for_each(&mut *add);
             }
             Ok(())
-        })
+        });
+        self.files.check()?;
+        check_unchanged(self.files.folder(), before, videos)?;
+        hash
     }
 }
 

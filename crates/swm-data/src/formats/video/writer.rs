@@ -17,7 +17,12 @@ const FPS: u32 = 25;
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("video")?;
     options.codec.check()?;
-    let known = || Ok(VideoReader::open(folder)?.schema().clone());
+    let continues = options.continues.clone();
+    let known = || {
+        let known = VideoReader::open(folder)?;
+        continues.iter().try_for_each(|continued| continued.check(&known, &folder.display()))?;
+        Ok(known.schema().clone())
+    };
     let (incoming, encoding) = (schema.clone(), Encoding::training(options.codec));
     let make = move |columns| VideoWriter { columns, schema: incoming, encoding };
     ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Videos, make, |writer| {

@@ -12,7 +12,7 @@ pub use losses::LEAST_PSNR;
 pub use shard::convert_shard;
 
 use crate::dataset::episodes::describe_columns;
-use crate::dataset::{CommitPolicy, Constants, Location, Reader, StepRange, WriteMode, WriteOptions};
+use crate::dataset::{CommitPolicy, Constants, Continued, Location, Reader, StepRange, WriteMode, WriteOptions};
 use crate::formats::{FORMATS, FormatEntry, create, detect, has_no_dataset, open, recover};
 use comparison::{data_columns, dataset_hash, episode_hash};
 use losses::{check_psnr, check_ratio, has_images, is_lossy};
@@ -209,7 +209,7 @@ fn convert_into(
         })?;
         check_psnr(&report.columns, options).map_err(|error| not_a_prefix(target, error.to_string()))?;
     }
-    drop(existing);
+    let continues = existing.map(|existing| Continued::of(&*existing)).transpose()?;
     if first < all || all == 0 {
         let mode = match options.mode {
             ConvertMode::Resume | ConvertMode::Append => WriteMode::Append,
@@ -218,7 +218,7 @@ fn convert_into(
         };
         let (codec, manifest, commit) = (options.codec, reader.manifest(), options.commit);
         // The position of the first episode in the target was read before the lock was taken.
-        let write = WriteOptions { mode, codec, manifest, commit, exclusive: true };
+        let write = WriteOptions { mode, codec, manifest, commit, exclusive: true, continues };
         let hashed = options.verify.then_some(&mut hashes[..]);
         let copied = source.copy(target, format, (write, base + first), first..all, hashed, &mut report, control);
         if is_new && copied.is_err() {
@@ -338,12 +338,19 @@ impl<'a> Source<'a> {
         let (first, all) = (episodes.start, self.reader.episodes().len());
         start(control, "convert", all);
         let hashed = hashes.is_some();
+        // A new thread is in no pool. One of the caller is passed on by its size: in a forked process, the global pool has no threads.
+        let threads = rayon::current_thread_index().map(|_| rayon::current_num_threads());
+        let pool = threads.map(|threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build()).transpose();
+        let pool = pool.map_err(|error| Error::external("starting the threads that decode", error))?;
         let outcome = scope(|scope| {
             let (to_writer, from_reader) = sync_channel(1);
             let (back, empty) = channel();
             Builder::new()
                 .name("swm-read".to_owned())
-                .spawn_scoped(scope, move || self.send(episodes, &to_writer, &empty, hashed))
+                .spawn_scoped(scope, move || {
+                    let send = move || self.send(episodes, &to_writer, &empty, hashed);
+                    if let Some(pool) = pool { pool.install(send) } else { send() }
+                })
                 .map_err(|error| Error::external("starting the thread that reads episodes", error))?;
             for (done, episode) in from_reader.into_iter().enumerate() {
                 let SourceEpisode { rows, constants, hash, cut } = episode?;

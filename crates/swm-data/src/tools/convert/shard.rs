@@ -27,7 +27,7 @@ pub fn convert_shard(
     let source = Source::new(&**reader);
     let episodes = shard.episodes(reader.episodes().len());
     let (codec, manifest, commit) = (options.codec, reader.manifest(), options.commit);
-    let write = WriteOptions { mode: WriteMode::Append, codec, manifest, commit, exclusive: true };
+    let write = WriteOptions { mode: WriteMode::Append, codec, manifest, commit, exclusive: true, continues: None };
     let mut writer = create_shard(target, &source.schema, write, shard)?;
     let existing = writer.episodes().min(episodes.len());
     let mut report = Converted {

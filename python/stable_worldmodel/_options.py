@@ -27,6 +27,21 @@ def count(name: str, value: Any, least: int = 1) -> int:
     return int(value)
 
 
+def whole(name: str, value: Any) -> int:
+    """The value as an integer.
+
+    Raises:
+        ValueError: When it is no whole number.
+    """
+    try:
+        fits = not isinstance(value, (bool, np.bool_)) and int(value) == value
+    except (TypeError, ValueError, OverflowError):
+        fits = False
+    if not fits:
+        raise ValueError(f"{name}: {value!r}; expected a whole number")
+    return int(value)
+
+
 def finite(name: str, value: Any) -> float:
     """The value as a finite number that is not negative.
 

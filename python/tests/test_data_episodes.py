@@ -1,5 +1,9 @@
 """Tests of an episode's own values, of merged datasets, and of videos of episodes."""
 
+import copy
+import json
+import pickle
+
 import numpy as np
 import pytest
 
@@ -47,6 +51,72 @@ def test_values_of_episodes_of_derived_datasets(tmp_path):
     assert swm.data.load_dataset(tmp_path / "c.lance").get_episode_data()["seed"].tolist() == [101, 102]
     assert swm.data.split_episode_data(episode(1))[1]["seed"] == 101
     assert sorted(swm.data.split_episode_data({"x": 1})[0]) == ["x"]
+
+
+def test_episodes_are_named_by_whole_numbers(tmp_path):
+    dataset = swm.data.load_dataset(written(tmp_path / "a.lance"), backend="numpy", num_steps=2)
+    buffer = swm.data.ReplayBuffer(max_steps=100, history_len=2)
+    buffer.write_episodes(episode(index) for index in range(3))
+    goals = swm.data.GoalDataset(dataset, goal_keys={"x": "goal_x"}, seed=0)
+    for wrong in ([True, False], 1.9):
+        for call in (dataset.get_episode_data, buffer.get_episode_data, dataset.constants, goals.__getitems__):
+            with pytest.raises(TypeError, match="whole numbers"):
+                call(wrong)
+    with pytest.raises(IndexError, match="episode 67"):
+        buffer.get_episode_data([67])
+    assert buffer.get_episode_data([-1])["seed"].tolist() == [102]
+    for index in (2**64 - 1, np.uint64(2**64 - 3)):
+        for call in (dataset.__getitem__, dataset.get_row_data, swm.data.ConcatDataset([dataset]).load_episode):
+            with pytest.raises(IndexError, match="larger than any index"):
+                call(index)
+    for offset in (-5, 0):
+        with pytest.raises(ValueError, match="counted from 1"):
+            swm.data.GoalDataset(dataset, current_goal_offset=offset)
+    with pytest.raises(TypeError, match="whole numbers"):
+        swm.data.GoalDataset(dataset, current_goal_offset=1.5)
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        {"dtype": "U250000000", "values": ["x"]},
+        {"dtype": "O", "values": [1]},
+        {"dtype": "uint8", "values": [1.7]},
+        {"dtype": "uint8", "values": [300]},
+        {"dtype": "float32", "values": [[1], [2, 3]]},
+        {"dtype": "float32", "values": {"a": 1}},
+        {"dtype": ["f4"], "values": [1]},
+        [1, 2],
+    ],
+)
+def test_values_of_a_foreign_file_have_their_type(tmp_path, item):
+    writer = swm._engine.Writer(str(tmp_path / "a.lance"), "lance", "error", None, [("x", "float64", [])], None)
+    writer.write({"x": np.arange(4.0)}, {EPISODE_DATA_KEY: json.dumps({"a": item})})
+    writer.finish()
+    with pytest.raises(ValueError, match="episode_data"):
+        swm.data.load_dataset(tmp_path / "a.lance").get_episode_data()
+
+
+def test_texts_of_a_buffer_stay_in_dumps_and_copies(tmp_path):
+    buffer = swm.data.ReplayBuffer(max_steps=100)
+    buffer.write_episode({**episode(1), "scene": "<mujoco/>"})
+    for copied in (pickle.loads(pickle.dumps(buffer)), copy.copy(buffer)):
+        assert copied.engine.constants(0)["scene"] == b"<mujoco/>" and copied.get_episode_data()["seed"].tolist() == [101]
+    buffer.dump(tmp_path / "a.lance")
+    assert swm.data.load_dataset(tmp_path / "a.lance").constants(0)["scene"] == b"<mujoco/>"
+
+
+def test_long_texts_of_episodes_are_not_padded():
+    table = swm.data._tensors.episode_table([{"task": "a" * 2**23}, {"task": "b"}, {"task": "c"}])["task"]
+    assert table.dtype == object and table[1:].tolist() == ["b", "c"]
+    assert swm.data._tensors.episode_table([{"task": "a"}, {"task": "b"}])["task"].dtype.kind == "U"
+
+
+def test_rows_beyond_an_episode_take_no_memory(tmp_path):
+    dataset = swm.data.load_dataset(written(tmp_path / "a.lance"), backend="numpy")
+    for start, length in ((0, 2**40), (2, 3), (2**62, 2**62)):
+        with pytest.raises(ValueError, match="rows of its 4"):
+            dataset.engine.read(["x"], *(np.array([value]) for value in (0, start, length)), 1)
 
 
 def test_merge_writes_all_episodes(tmp_path):

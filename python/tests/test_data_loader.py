@@ -182,6 +182,16 @@ def test_wrong_arguments_raise_errors_with_the_reason(stored, tmp_path):
         loader(path, batch_size=0)
     with pytest.raises(ValueError, match="no negative numbers, got {'threads': -1}"):
         loader(path, threads=-1)
+    for name in ("batch_size", "num_steps", "frameskip", "rank", "world_size", "threads", "prefetch", "seed"):
+        for wrong in (1.5, b"3", True, None if name == "batch_size" else "2"):
+            with pytest.raises(ValueError, match=f"{name}: .*; expected a whole number"):
+                loader(path, **{name: wrong})
+    for call in (
+        lambda: swm.data.ReplayBuffer(9, frameskip=1.5),
+        lambda: swm.data.ReplayBuffer(9).sample(2, 1.5),
+    ):
+        with pytest.raises(ValueError, match="whole number"):
+            call()
     with pytest.raises(ValueError, match="'12XB'"):
         loader(path, cache="12XB")
     with pytest.raises(FileNotFoundError):

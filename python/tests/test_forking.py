@@ -108,6 +108,31 @@ print(json.dumps([said, status, data.load_dataset({str(tmp_path / name)!r}).num_
     assert episodes == 2
 
 
+@pytest.mark.parametrize("end", ["lance", "h5", "folder", "video", "lerobot"])
+def test_new_writers_work_in_a_forked_process(tmp_path, end):
+    text = f"""
+import numpy as np
+from stable_worldmodel import data
+rows = {{"state": np.zeros((3, 2), np.float32), "pixels": np.zeros((3, 16, 16, 3), np.uint8)}}
+rows["action"] = np.zeros((2, 1), np.float32)
+def write(name):
+    with data.open_writer(name, format={end!r} if {end!r} in ("folder", "video", "lerobot") else None) as writer:
+        writer.write_episodes([rows] * 4)
+    return name
+def all_ways():
+    data.convert(write("child.{end}"), "converted.lance", progress=False)
+    data.merge(["child.{end}", "converted.lance"], "merged.lance", progress=False)
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episode(rows)
+    buffer.dump("dumped.{end if end in ("lance", "h5") else "lance"}")
+data.load_dataset(write("parent.{end}")).get_col_data("pixels")
+{in_fork("all_ways()")}
+names = ["child.{end}", "converted.lance", "merged.lance"]
+print(json.dumps([said, status, [data.load_dataset(name).num_episodes for name in names]]))
+"""
+    assert run(tmp_path, text) == ["no error", 0, [4, 4, 8]]
+
+
 @pytest.mark.parametrize(("threads", "words"), [(1, "no error"), (2, "threads=1 or workers=True")])
 def test_gymnasium_world_inside_the_step_of_another(tmp_path, threads, words):
     text = f"""

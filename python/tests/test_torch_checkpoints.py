@@ -100,6 +100,39 @@ def test_models_are_replaced_as_a_whole_and_checkpoints_of_the_engine_are_not(ho
     assert [file.name for file in run.iterdir()] == ["config.json"]
 
 
+def test_configurations_of_many_modules_or_without_memory_are_refused(home):
+    layer = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 2}
+    save_pretrained(torch.nn.Linear(2, 2), "mine", {**layer, "device": "meta"})
+    with pytest.raises(ValueError, match="meta"):
+        load_pretrained("mine")
+    many = {"_target_": "torch.nn.Sequential", "_args_": [{"_target_": "torch.nn.Identity"}] * 5000}
+    save_pretrained(torch.nn.Linear(2, 2), "many", many)
+    with pytest.raises(ValueError, match="5001 modules"):
+        load_pretrained("many")
+
+
+def test_files_of_the_user_and_of_the_engine_are_not_replaced(home):
+    config = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 2}
+    model, folder = torch.nn.Linear(2, 2), home / "checkpoints/mine"
+    folder.mkdir(parents=True)
+    contents = {"model.pt": "a text", "config.json": '{"_target_": "mine"}', "thesis.txt": "a thesis"}
+    for name, content in contents.items():
+        (folder / name).write_text(content)
+    for name in ("weights.pt", "model.pt", "thesis.txt"):
+        with pytest.raises(FileExistsError, match="did not write"):
+            save_pretrained(model, "mine", config, filename=name)
+    with pytest.raises(FileExistsError, match="thesis"):
+        save_pretrained(model, "mine", filename="thesis.txt")
+    assert {file.name: file.read_text() for file in folder.iterdir()} == contents
+    for name in ("config.json", "weights.safetensors", "../weights.pt", ""):
+        with pytest.raises(ValueError, match="plain name"):
+            save_pretrained(model, "new", config, filename=name)
+    (folder / "weights.safetensors").write_text("weights of the engine")
+    with pytest.raises(FileExistsError, match="of the engine"):
+        save_pretrained(model, "mine", filename="new.pt")
+    assert not (home / "checkpoints/new").exists() and not (folder / "new.pt").exists()
+
+
 @pytest.mark.parametrize(
     "target",
     [

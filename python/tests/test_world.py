@@ -262,6 +262,38 @@ def test_restored_snapshot_repeats_the_next_step():
     assert np.array_equal(world.infos["state"], after)
 
 
+def test_numbers_of_steps_are_whole_and_actions_are_numbers():
+    world = swm.World("swm/TwoRoom-v1", num_envs=1, add_pixels=False)
+    world.set_policy(swm.policy.RandomPolicy(1))
+    world.reset(seed=0)
+    for wrong in (2.7, "3", -1, None):
+        with pytest.raises(ValueError, match="steps: .*whole number"):
+            world.step(wrong)
+    world.step(0)
+    for wrong in ([["0.5", "0.5"]], np.array([["2020-01-01", "2020-01-02"]], "M8[s]")):
+        with pytest.raises(ValueError, match="expected real actions"):
+            world.envs.step(wrong)
+
+
+def test_changed_snapshots_are_refused():
+    # The contacts of Push-T's simulation are at the end; a changed index was restored, and the next step failed.
+    world = swm.World("swm/PushT-v1", num_envs=1, add_pixels=False)
+    world.set_policy(swm.policy.RandomPolicy(1))
+    world.reset(seed=0)
+    world.step(2)
+    state = world.snapshot()
+    for at in range(0, len(state), 101):
+        changed = bytearray(state)
+        changed[at] ^= 0xFF
+        with pytest.raises(ValueError, match="missing or changed"):
+            world.restore(bytes(changed))
+    for wrong in (b"", state[:-1], state[:9]):
+        with pytest.raises(ValueError, match="missing or changed"):
+            world.restore(wrong)
+    world.restore(state)
+    world.step()
+
+
 @pytest.mark.parametrize("index", [-1, 2, 2**70])
 def test_indices_of_no_environment_are_refused(index):
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16))

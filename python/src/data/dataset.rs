@@ -231,6 +231,14 @@ fn invalid_mark(error: serde_json::Error) -> PyErr {
 
 /// Reads each column as one batch: all rows of `action`, every `frameskip`-th row of other columns.
 fn read(reader: &dyn Reader, names: &[String], runs: &[StepRange], frameskip: usize) -> Result<Vec<Batch>> {
+    // Before memory for the rows is reserved.
+    for run in runs {
+        let rows = reader.episodes().get(run.episode).map_or(0, |episode| episode.length);
+        if run.start.checked_add(run.length).is_none_or(|end| end > rows) {
+            let given = format!("{} rows from row {} of episode {}", run.length, run.start, run.episode);
+            return Err(Error::mismatch("reading rows", given, format!("rows of its {rows}")));
+        }
+    }
     let skipped: Vec<StepRange> = match frameskip {
         1 => vec![],
         _ => runs

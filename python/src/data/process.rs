@@ -63,7 +63,15 @@ impl<T> Drop for Owned<T> {
 /// # Errors
 /// The error of `work`, or a failure to start the thread of a forked process.
 pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
-    py.detach(|| if is_forked() { forked_pool()?.install(work) } else { work() })
+    in_pool(py, work)?
+}
+
+/// As [`detached`], for work with errors of its own.
+///
+/// # Errors
+/// A failure to start the thread of a forked process.
+pub fn in_pool<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> Result<T> {
+    py.detach(|| if is_forked() { Ok(forked_pool()?.install(work)) } else { Ok(work()) })
 }
 
 /// The thread pool of this forked process, leaked because it lives until the process ends.

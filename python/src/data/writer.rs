@@ -1,6 +1,6 @@
 //! [`Writer`]: writes episodes into a dataset in one of the engine's formats.
 
-use super::process::Owned;
+use super::process::{Owned, detached, in_pool};
 use super::{Column, image_codec, schema, write_mode};
 use crate::arrays;
 use crate::errors::{json, to_py_err};
@@ -34,7 +34,7 @@ impl Writer {
         let manifest = manifest.map(|text| json("manifest", text)).transpose()?;
         let options =
             WriteOptions { mode: write_mode(mode), codec: image_codec(codec)?, manifest, ..WriteOptions::default() };
-        let made = py.detach(|| {
+        let made = detached(py, || {
             let location = home::target(path, format)?;
             match format {
                 Some(format) => FORMATS.get(format)?.create(&location, &schema, options),
@@ -47,10 +47,11 @@ impl Writer {
     /// Adds an episode (arrays `[rows, ..]` with the schema's columns in order) and its constants.
     fn write(&self, py: Python<'_>, episode: &Bound<'_, PyDict>, constants: &Bound<'_, PyDict>) -> PyResult<()> {
         let (episode, constants) = (arrays::batch(episode)?, super::constants(constants)?);
-        py.detach(|| match &mut *self.lock()? {
+        let write = || match &mut *self.lock()? {
             Some(writer) => writer.write_episode_with(&episode, &constants).map_err(to_py_err),
             None => Err(PyValueError::new_err("the writer is closed: open another one, with mode='append'")),
-        })
+        };
+        in_pool(py, write).map_err(to_py_err)?
     }
 
     /// The number of episodes in the dataset; `None` once the writer is finished.
@@ -60,7 +61,8 @@ impl Writer {
 
     /// Commits the remaining episodes and closes the writer.
     fn finish(&self, py: Python<'_>) -> PyResult<()> {
-        py.detach(|| self.lock()?.take().map_or(Ok(()), |writer| writer.finish().map_err(to_py_err)))
+        let finish = || self.lock()?.take().map_or(Ok(()), |writer| writer.finish().map_err(to_py_err));
+        in_pool(py, finish).map_err(to_py_err)?
     }
 }
 

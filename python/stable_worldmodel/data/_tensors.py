@@ -147,10 +147,13 @@ def whole(what: str, given: Any) -> Array:
 
     Raises:
         TypeError: When the values are no whole numbers, such as those of a mask.
+        IndexError: When a value is larger than any index.
     """
     array = np.asarray(given)
     if array.size and array.dtype.kind not in "iu":
         raise TypeError(f"{what}: expected whole numbers, got {array.dtype}; np.flatnonzero gives the indices of a mask")
+    if array.size and array.max() > np.iinfo(np.int64).max:
+        raise IndexError(f"{what}: {array.max()} is larger than any index")
     return array.astype(np.int64)
 
 
@@ -192,9 +195,30 @@ def episode_values(text: bytes | None) -> dict[str, Any]:
     if text is None:
         return {}
     stored = json.loads(text)
-    return {
-        key: item if isinstance(item, str) else np.array(item["values"], dtype=item["dtype"]) for key, item in stored.items()
-    }
+    if not isinstance(stored, dict):
+        raise ValueError(f"{EPISODE}: expected an object of JSON, got {type(stored).__name__}")
+    return {key: item if isinstance(item, str) else _numbers(key, item) for key, item in stored.items()}
+
+
+#: The types of an episode's own values.
+_NUMERIC = frozenset("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 float32 float64".split())
+
+
+def _numbers(name: str, item: Any) -> Array:
+    """The array that `_described` stored. A file of somebody else can state any type and any values."""
+    dtype, values = (item.get("dtype"), item.get("values")) if isinstance(item, dict) else (None, None)
+    if not isinstance(dtype, str) or dtype not in _NUMERIC:
+        raise ValueError(f"{EPISODE}[{name!r}]: expected text, or values of a numeric type, got the type {str(dtype)[:40]!r}")
+    try:
+        given = np.asarray(values)
+        with np.errstate(over="ignore", invalid="ignore"):
+            array = given.astype(dtype)
+        fits = given.dtype.kind in "biuf" and np.array_equal(array, given, equal_nan=given.dtype.kind == "f")
+    except (TypeError, ValueError, OverflowError):
+        fits = False
+    if not fits:
+        raise ValueError(f"{EPISODE}[{name!r}]: its values are not of its type {dtype}")
+    return array
 
 
 def episode_table(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
@@ -202,7 +226,18 @@ def episode_table(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
     if not episodes:
         return {}
     shared = [name for name in episodes[0] if all(name in episode for episode in episodes)]
-    return {name: np.stack([np.asarray(episode[name]) for episode in episodes]) for name in shared}
+    return {name: _stacked([episode[name] for episode in episodes]) for name in shared}
+
+
+#: The most characters of texts that are padded to the longest.
+_MOST_CHARACTERS = 1 << 24
+
+
+def _stacked(values: list[Any]) -> Array:
+    """The values along a new first axis. Long texts are objects: numpy would pad each to the longest."""
+    if all(isinstance(value, str) for value in values) and len(values) * max(map(len, values)) > _MOST_CHARACTERS:
+        return np.array(values, dtype=object)
+    return np.stack([np.asarray(value) for value in values])
 
 
 def _text(name: str, value: Any) -> str | bytes | None:

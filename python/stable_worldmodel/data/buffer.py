@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from stable_worldmodel import _engine
+from stable_worldmodel import _engine, _options
 
 from . import _tensors
 from ._tensors import NUMBERING, Array
@@ -75,6 +75,8 @@ class _Content(Dataset):
         return self.transform(sample) if self.transform else sample
 
     def _episode_values(self, episode: int) -> dict[str, Any]:
+        if not -self.num_episodes <= episode < self.num_episodes:
+            raise IndexError(f"episode {episode} is outside the buffer, which has {self.num_episodes} episodes")
         return _tensors.episode_values(self.engine.constants(episode % self.num_episodes).get(_tensors.EPISODE))
 
     def get_col_data(self, col: str) -> Array:
@@ -94,7 +96,8 @@ class _Content(Dataset):
         for episode in range(self.num_episodes):
             number, start, length = (np.asarray([n]) for n in (episode, 0, self.lengths[episode]))
             values = self._episode_values(episode)
-            steps: dict[str, Any] = self._read(number, start, length, 1)
+            texts = {name: text for name, text in self.engine.constants(episode).items() if name != _tensors.EPISODE}
+            steps: dict[str, Any] = {**self._read(number, start, length, 1), **texts}
             yield {**steps, _tensors.EPISODE: values} if values else steps
 
 
@@ -102,7 +105,7 @@ class ReplayBuffer(Dataset):
     """The latest episodes, with at most `max_steps` rows: a writer for collection and a dataset for training.
 
         buffer = ReplayBuffer(max_steps=100_000, history_len=4)
-        world.collect(buffer, episodes=10)
+        world.collect(writer=buffer, episodes=10)
         batch = buffer.sample(256)  # arrays (256, 4, ...)
 
     When an episode does not fit, the oldest episodes are removed. Samples depend only on the seed, the step and the content
@@ -133,14 +136,14 @@ class ReplayBuffer(Dataset):
         seed: int = 0,
     ) -> None:
         for name, value in (("max_steps", max_steps), ("history_len", history_len), ("frameskip", frameskip)):
-            if value < 1:
+            if _options.whole(name, value) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {value}")
-        super().__init__([], [], frameskip, history_len, transform)
+        super().__init__([], [], int(frameskip), int(history_len), transform)
         self.max_steps = int(max_steps)
         self.history_len = int(history_len)
         self.sampler = sampler
         self.key_filter = key_filter
-        self.seed = int(seed)
+        self.seed = _options.whole("seed", seed)
         self._buffer: Any = None
         self._columns: list[tuple[str, str, list[int]]] = []
         #: Held while the content changes, and while a sampler of the user, which may call the buffer, chooses from it.
@@ -250,7 +253,8 @@ class ReplayBuffer(Dataset):
             Arrays `(batch_size, history_len, ...)`; `action` is `(batch_size, history_len, frameskip * dim)`, images
             `(batch_size, history_len, H, W, C)`.
         """
-        steps = self.history_len if history_len is None else int(history_len)
+        steps = self.history_len if history_len is None else _options.whole("history_len", history_len)
+        batch_size = _options.whole("batch_size", batch_size)
         if batch_size < 1 or steps < 1:
             raise ValueError(f"expected a batch_size and history_len of at least 1, got {batch_size} and {steps}")
         with self._lock:
@@ -315,7 +319,7 @@ class ReplayBuffer(Dataset):
         return self._now.get_row_data(row_idx)
 
     def episodes(self) -> Iterator[dict[str, Any]]:
-        """Yields the episodes of now, oldest first, as dicts of arrays `(T, ...)`."""
+        """Yields the episodes of now, oldest first, as dicts of arrays `(T, ...)`, and of the bytes of their texts."""
         return self._now.episodes()
 
     def dump(self, path: str | os.PathLike[str], format: str | None = None, mode: str = "overwrite", **kwargs: Any) -> None:

@@ -138,8 +138,8 @@ class Dataset:
 
     def get_episode_data(self, episodes_idx: Sequence[int] | Array | None = None) -> dict[str, Array]:
         """The values of episodes, `(episodes, ..)`; of all episodes for `None`."""
-        wanted = range(self.num_episodes) if episodes_idx is None else np.asarray(episodes_idx).reshape(-1).tolist()
-        return _tensors.episode_table([self._episode_values(int(episode)) for episode in wanted])
+        given = np.arange(self.num_episodes) if episodes_idx is None else _tensors.whole("episodes_idx", episodes_idx)
+        return _tensors.episode_table([self._episode_values(int(episode)) for episode in given.reshape(-1)])
 
     def _episode_values(self, episode: int) -> dict[str, Any]:
         """The values of one episode."""
@@ -259,7 +259,7 @@ class StoredDataset(Dataset):
 
     def constants(self, episode_idx: int) -> dict[str, bytes]:
         """The non-numeric constants of an episode, such as the XML of its scene."""
-        return dict(self.engine.constants(int(episode_idx)))
+        return dict(self.engine.constants(int(_tensors.whole("episode_idx", episode_idx))))
 
     def _episode_values(self, episode: int) -> dict[str, Any]:
         wanted = episode + self.num_episodes if episode < 0 else episode
@@ -638,7 +638,10 @@ class GoalDataset:
         self.dataset = dataset
         self.goal_probabilities = tuple(goal_probabilities)
         self.gamma = gamma
-        self.current_goal_offset = dataset.num_steps if current_goal_offset is None else current_goal_offset
+        offset = dataset.num_steps if current_goal_offset is None else current_goal_offset
+        self.current_goal_offset = int(_tensors.whole("current_goal_offset", offset))
+        if self.current_goal_offset < 1:
+            raise ValueError(f"current_goal_offset: expected a step of the clip, counted from 1, got {current_goal_offset}")
         if goal_keys is None:
             goal_keys = {name: f"goal_{name}" for name in ("pixels", "proprio") if name in dataset.column_names}
         self.goal_keys = dict(goal_keys)
@@ -658,7 +661,10 @@ class GoalDataset:
         self._clips = clips[later]
 
     def set_epoch(self, epoch: int) -> None:
-        """Sets the epoch, which determines the goals together with the seed."""
+        """Sets the epoch, which determines the goals together with the seed.
+
+        Workers of a `DataLoader` get it when they start: with `persistent_workers=True` they keep the first epoch.
+        """
         self.epoch = int(epoch)
 
     @property
@@ -718,6 +724,7 @@ class GoalDataset:
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
         """The samples of a batch."""
+        indices = _tensors.whole("indices", indices).tolist()
         wrong = [i for i in indices if not -len(self) <= i < len(self)]
         if wrong:
             raise IndexError(f"clip {wrong[0]} is outside the dataset, which has {len(self)} clips")

@@ -156,8 +156,8 @@ class Loader:
         self.device = device
         self.pin_memory = bool(pin_memory) and self.backend == "torch" and _tensors.has_gpu()
         self.transform = transform if transform is not None else getattr(dataset, "transform", None)
-        self.batch_size = int(batch_size)
-        self.seed = int(seed)
+        self.batch_size = _options.whole("batch_size", batch_size)
+        self.seed = _options.whole("seed", seed)
         if cache is None:
             cache = "512MiB" if isinstance(dataset, (StoredDataset, ConcatDataset, MergeDataset)) else 0
         engine = engine_of(dataset)
@@ -170,8 +170,9 @@ class Loader:
         if unknown:
             raise KeyError(f"there is no column {unknown[0]!r}; the columns are {', '.join(stored)}")
         given = [goals] if isinstance(goals, Goals) else list(goals or [])
-        self.num_steps = int(num_steps if num_steps is not None else getattr(dataset, "num_steps", 1))
-        self.frameskip = int(frameskip if frameskip is not None else getattr(dataset, "frameskip", 1))
+        num_steps = num_steps if num_steps is not None else getattr(dataset, "num_steps", 1)
+        frameskip = frameskip if frameskip is not None else getattr(dataset, "frameskip", 1)
+        self.num_steps, self.frameskip = _options.whole("num_steps", num_steps), _options.whole("frameskip", frameskip)
         settings = {
             "num_steps": self.num_steps,
             "frameskip": self.frameskip,
@@ -181,10 +182,10 @@ class Loader:
             "shuffle": bool(shuffle),
             "seed": self.seed,
             "drop_last": bool(drop_last),
-            "rank": int(rank),
-            "ranks": int(world_size),
-            "threads": int(threads),
-            "prefetch": int(prefetch),
+            "rank": _options.whole("rank", rank),
+            "ranks": _options.whole("world_size", world_size),
+            "threads": _options.whole("threads", threads),
+            "prefetch": _options.whole("prefetch", prefetch),
             "prefetch_bytes": bytes_of(prefetch_bytes),
             "episodes": None if episodes is None else _options.indices("episodes", episodes, len(engine.lengths())),
             "cache": bytes_of(cache),

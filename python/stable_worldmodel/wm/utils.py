@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Callable, Mapping
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ from ._weights import load_into, read_state_dict
 from .checkpoints import is_stored, module_of
 
 __all__ = ["load_pretrained", "save_pretrained"]
+
+#: Modules without weights, beside those with a tensor in the file.
+_FREE_MODULES = 4096
 
 #: The largest size of a configuration, in bytes.
 _MOST_SETTINGS = 16 << 20
@@ -52,22 +56,48 @@ def save_pretrained(
         cache_dir: A folder in place of `$STABLEWM_HOME`.
 
     Raises:
-        FileExistsError: If the folder has a checkpoint of the engine, or a `config.json` without weights.
+        ValueError: If the name of the file is no plain name, or that of another file of a checkpoint.
+        FileExistsError: If the folder has a checkpoint of the engine, or a file to replace is none that this function writes.
     """
     folder = _folder(cache_dir) / run_name
+    settings, stored = folder / "config.json", folder / filename
+    if not filename or Path(filename).name != filename or filename in ("config.json", "manifest.json", "weights.safetensors"):
+        raise ValueError(f"filename: expected a plain name for the weights, such as 'weights.pt', got {filename!r}")
+    if (folder / "weights.safetensors").exists():
+        raise FileExistsError(f"{folder}: it holds a checkpoint of the engine; choose another run_name")
+    is_other = config is not None and os.path.lexists(settings) and not (_is_settings(settings) and any(_saved(folder)))
+    for file in [stored] * (os.path.lexists(stored) and not _is_saved(stored)) + [settings] * is_other:
+        raise FileExistsError(f"{file}: save_pretrained did not write this file; choose another run_name")
     folder.mkdir(parents=True, exist_ok=True)
-    settings = folder / "config.json"
-    is_other = (folder / "weights.safetensors").exists() or (settings.exists() and not any(folder.glob("*.pt")))
-    if is_other and config is not None:
-        raise FileExistsError(f"{settings}: save_pretrained did not write this file; choose another run_name")
     weights = model.state_dict()
-    files: dict[Path, Callable[[Path], object]] = {folder / filename: lambda beside: torch.save(weights, beside)}
+    files: dict[Path, Callable[[Path], object]] = {stored: lambda beside: torch.save(weights, beside)}
     if config is None:
         warnings.warn(f"{folder}: saved without a config, so load_pretrained cannot build the model", stacklevel=2)
     else:
         text = json.dumps(_plain(config[config_key] if config_key is not None and config_key in config else config), indent=2)
         files[settings] = lambda beside: beside.write_text(text)
     _files.replace(files)
+
+
+def _is_saved(file: Path) -> bool:
+    """Whether a file is one of `torch.save`: an archive with a pickle."""
+    if not file.is_file() or not zipfile.is_zipfile(file):
+        return False
+    with zipfile.ZipFile(file) as archive:
+        return any(name.endswith("/data.pkl") for name in archive.namelist())
+
+
+def _saved(folder: Path) -> Iterator[Path]:
+    return (file for file in folder.iterdir() if _is_saved(file))
+
+
+def _is_settings(file: Path) -> bool:
+    """Whether a file holds the configuration of a model, as `save_pretrained` writes it."""
+    try:
+        config = _read_settings(file)
+    except (OSError, ValueError):
+        return False
+    return isinstance(config, dict) and "_target_" in json.dumps(config)
 
 
 def _plain(config: Any) -> Any:
@@ -138,11 +168,26 @@ def _read_settings(path: Path) -> Any:
 
 def _built(config: Any, stored_bytes: int, stored_tensors: int) -> Any:
     """The model of a configuration that is not trusted, of the size of its weights."""
+    if _modules(config) > stored_tensors + _FREE_MODULES:
+        raise ValueError(
+            f"the configuration describes {_modules(config)} modules, and the weights have {stored_tensors} tensors; "
+            "pass trust=True if you trust the files"
+        )
     # Without memory first: a large model is refused before it takes any.
     with bounded(stored_bytes, stored_tensors), torch.device("meta"):
         build(config)
     with bounded(stored_bytes, stored_tensors):
-        return build(config)
+        model = build(config)
+    if isinstance(model, nn.Module) and any(value.is_meta for value in [*model.parameters(), *model.buffers()]):
+        raise ValueError("the configuration places weights on the device 'meta', which has no memory for them")
+    return model
+
+
+def _modules(config: Any) -> int:
+    """The number of modules that a configuration names."""
+    if isinstance(config, Mapping):
+        return ("_target_" in config) + sum(_modules(value) for value in config.values())
+    return sum(_modules(value) for value in config) if isinstance(config, list) else 0
 
 
 def _located(name: str, folder: Path) -> Path:

@@ -324,13 +324,12 @@ class World:
         """
         if self.policy is None:
             raise RuntimeError("World.step: no policy; call set_policy first")
+        steps = 1 if steps == 1 else _options.count("steps", steps, 0)
         if self.seed is None:
             self.reset()
         actor = self._actor(self.policy)
         if actor is not None and isinstance(self._reset_text, str):
-            begun, self._next_episode = self._world.play(
-                actor, int(steps), self.seed or 0, self._next_episode, self._reset_text
-            )
+            begun, self._next_episode = self._world.play(actor, steps, self.seed or 0, self._next_episode, self._reset_text)
             for slot, episode in begun:
                 self._episodes[slot] = episode
             if begun:
@@ -421,8 +420,9 @@ class World:
             expected = self.envs.action_space.shape
             raise ValueError(f"{what}: got actions of shape {given.shape}, expected {expected}")
         given = given.reshape(want.shape)
-        if given.dtype.kind == "c":
-            raise ValueError(f"{what}: expected real actions, got complex numbers")
+        if given.dtype.kind in "cSUmMV":
+            kind = "complex numbers" if given.dtype.kind == "c" else str(given.dtype)
+            raise ValueError(f"{what}: expected real actions, got {kind}")
         if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
             raise ValueError(f"{what}: expected finite actions, got {given[active]}")
         if want.dtype.kind != "f":

@@ -187,8 +187,8 @@ def test_wrong_arguments_raise_errors_with_the_reason(stored, tmp_path):
             with pytest.raises(ValueError, match=f"{name}: .*; expected a whole number"):
                 loader(path, **{name: wrong})
     for call in (
-        lambda: swm.data.ReplayBuffer(9, frameskip=1.5),
-        lambda: swm.data.ReplayBuffer(9).sample(2, 1.5),
+        lambda: data.ReplayBuffer(9, frameskip=1.5),
+        lambda: data.ReplayBuffer(9).sample(2, 1.5),
     ):
         with pytest.raises(ValueError, match="whole number"):
             call()

@@ -115,17 +115,17 @@ import numpy as np
 from stable_worldmodel import data
 rows = {{"state": np.zeros((3, 2), np.float32), "pixels": np.zeros((3, 16, 16, 3), np.uint8)}}
 rows["action"] = np.zeros((2, 1), np.float32)
-def write(name):
+def written(name):
     with data.open_writer(name, format={end!r} if {end!r} in ("folder", "video", "lerobot") else None) as writer:
         writer.write_episodes([rows] * 4)
     return name
 def all_ways():
-    data.convert(write("child.{end}"), "converted.lance", progress=False)
+    data.convert(written("child.{end}"), "converted.lance", progress=False)
     data.merge(["child.{end}", "converted.lance"], "merged.lance", progress=False)
     buffer = data.ReplayBuffer(100)
     buffer.write_episode(rows)
     buffer.dump("dumped.{end if end in ("lance", "h5") else "lance"}")
-data.load_dataset(write("parent.{end}")).get_col_data("pixels")
+data.load_dataset(written("parent.{end}")).get_col_data("pixels")
 {in_fork("all_ways()")}
 names = ["child.{end}", "converted.lance", "merged.lance"]
 print(json.dumps([said, status, [data.load_dataset(name).num_episodes for name in names]]))

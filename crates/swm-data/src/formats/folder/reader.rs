@@ -20,6 +20,8 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
 pub(super) struct FolderReader {
     files: ColumnFiles,
     schema: Schema,
+    /// The state of some images when the dataset was opened.
+    opened: blake3::Hash,
 }
 
 impl FolderReader {
@@ -34,7 +36,8 @@ impl FolderReader {
             None => infer_image_columns(&files)?,
         };
         let schema = files.schema(images)?;
-        Ok(Self { files, schema })
+        let opened = state_of(|visit| sampled_images(&files, &schema, visit));
+        Ok(Self { files, schema, opened })
     }
 
     fn read_images(&self, column: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
@@ -123,7 +126,21 @@ impl Reader for FolderReader {
         });
         self.files.check()?;
         check_unchanged(self.files.folder(), before, images)?;
+        check_unchanged(self.files.folder(), self.opened, |visit| sampled_images(&self.files, &self.schema, visit))?;
         hash
+    }
+}
+
+/// Visits the paths of an image in up to 16 episodes at equal distances.
+fn sampled_images(files: &ColumnFiles, schema: &Schema, visit: &mut dyn FnMut(&Path)) {
+    let episodes = files.rows().episodes().len();
+    let sampled = episodes.min(16);
+    for column in schema.columns().iter().filter(|column| column.is_image()) {
+        for position in (0..sampled).map(|i| i * episodes / sampled) {
+            for suffix in SUFFIXES {
+                visit(&image_path(files.folder(), &column.name, position, 0, suffix));
+            }
+        }
     }
 }
 

@@ -15,6 +15,18 @@ from pathlib import Path
 _MOST_WAIT = 30.0
 
 
+def local(what: str, path: str | os.PathLike[str]) -> Path:
+    """The path of an output of this machine.
+
+    Raises:
+        ValueError: When it is a URI, which would become a folder such as `s3:`.
+    """
+    scheme, separator, _ = os.fspath(path).partition("://")
+    if separator and scheme.isalnum():
+        raise ValueError(f"{what}: {os.fspath(path)!r} is a URI; expected a path of this machine")
+    return Path(path)
+
+
 @contextlib.contextmanager
 def locked(folder: Path, *, exclusive: bool) -> Iterator[None]:
     """Waits for writers of a folder's files, and with `exclusive` for readers, too, so that several files are read as written.

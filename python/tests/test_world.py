@@ -175,6 +175,18 @@ def test_metrics_replace_older_results_as_a_whole_and_nothing_else(tmp_path):
     assert thesis.read_text() == "thesis"
 
 
+def test_results_and_videos_stay_on_this_machine(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    world = swm.World("swm/TwoRoom-v1", num_envs=1, image_shape=(16, 16), max_episode_steps=3)
+    world.set_policy(swm.policy.RandomPolicy(1))
+    with pytest.raises(ValueError, match="video: 's3://bucket/v' is a URI"):
+        world.evaluate(episodes=1, seed=0, video="s3://bucket/v", progress=False)
+    metrics = world.evaluate(episodes=1, seed=0, progress=False)
+    with pytest.raises(ValueError, match="path: 'gs://bucket/r.json' is a URI"):
+        metrics.save("gs://bucket/r.json")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_threads_save_metrics_to_one_file(tmp_path):
     metrics = rooms(num_envs=2).evaluate(policy=swm.policy.RandomPolicy(), episodes=2, seed=1, progress=False)
     with ThreadPoolExecutor(8) as threads:

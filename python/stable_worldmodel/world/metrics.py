@@ -72,8 +72,9 @@ class Metrics(dict[str, Any]):
 
         Raises:
             FileExistsError: If there is another file.
+            ValueError: If the path is a URI.
         """
-        path = Path(path)
+        path = _files.local("path", path)
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and path.stat().st_size > 0 and not _is_results(path):
             raise FileExistsError(f"{path}: this file holds no results; choose another name, or remove it")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from .. import _engine, _options, _progress
+from .. import _engine, _files, _options, _progress
 from .. import spaces as swm_spaces
 from ..wrapper.visual import engine_wrappers
 from .env_pool import WorldEnvs
@@ -656,7 +656,7 @@ class World:
         for name, actor in acting:
             recording = None
             if video is not None and not runs:
-                folder = Path(video)
+                folder = _files.local("video", video)
                 folder.mkdir(parents=True, exist_ok=True)
                 recording = [str(folder), "episode", episodes if videos is None else int(videos)]
             given = json.dumps({**config, "policy": name, "videos": recording})

@@ -35,8 +35,8 @@ pub fn object_list(py: Python<'_>, folder: &str) -> PyResult<Vec<String>> {
     at(py, folder, objects::list_files)
 }
 
-/// The architecture and the vector instructions of this processor, on which the last bits of models depend.
+/// What the last bits of models depend on: the architecture of this processor and its vector instructions, where they matter.
 #[pyfunction]
 pub fn cpu_level() -> String {
-    swm::capsule::cpu_level()
+    swm::capsule::arithmetic(&swm::capsule::cpu_level()).to_owned()
 }

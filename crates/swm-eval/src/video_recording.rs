@@ -59,11 +59,6 @@ impl Videos {
         format!("{}-{index}.mp4", self.prefix)
     }
 
-    /// The path of the poster of a video.
-    fn poster(&self, index: usize) -> PathBuf {
-        self.root.join(self.name(index)).with_extension("png")
-    }
-
     /// Where the file of a video is written.
     fn written(&self, index: usize) -> PathBuf {
         let root = if self.staged { self.root.join(STAGED) } else { self.root.clone() };
@@ -134,17 +129,26 @@ impl VideoRecording {
         };
         let (schema, count) = (pool.infos().schema(), videos.count.min(episodes));
         // All videos are in the folder of the first one.
-        if let Some(folder) =
-            (count > 0).then(|| videos.root.join(videos.name(0)).parent().map(Path::to_owned)).flatten()
-            && folder != videos.root
-            && (folder.is_symlink() || (folder.exists() && !folder.is_dir()))
-        {
+        let folder = |path: PathBuf| path.parent().map(Path::to_owned);
+        let mut folders = vec![];
+        if count > 0 {
+            folders.extend(folder(videos.root.join(videos.name(0))));
+            if videos.staged {
+                folders.extend([Some(videos.root.join(STAGED)), folder(videos.written(0))].into_iter().flatten());
+            }
+        }
+        let is_occupied = |folder: &&PathBuf| {
+            **folder != videos.root && (folder.is_symlink() || (folder.exists() && !folder.is_dir()))
+        };
+        if let Some(folder) = folders.iter().find(is_occupied) {
             let problem = "it is a file or a symbolic link, where the folder of the videos should be";
             return Err(Error::config(folder.display().to_string(), problem, "move it away, or choose another output"));
         }
         for i in 0..count {
-            swm_data::check_mp4(&videos.root.join(videos.name(i)))?;
-            swm_data::check_png(&videos.poster(i))?;
+            for path in [videos.root.join(videos.name(i)), videos.written(i)] {
+                swm_data::check_mp4(&path)?;
+                swm_data::check_png(&path.with_extension("png"))?;
+            }
         }
         Ok(Self {
             videos: videos.clone(),

@@ -99,7 +99,13 @@ pub fn to_rgb(frame: &frame::Video, width: usize, height: usize, out: &mut [u8])
     if (frame.width() as usize, frame.height() as usize, out.len()) != (width, height, width * height * 3) {
         return false;
     }
-    let matrix = Matrix::new(frame.color_space(), full || frame.color_range() == Range::JPEG);
+    // Grey frames that state no range have the full one, as FFmpeg takes them.
+    let full = match frame.color_range() {
+        Range::JPEG => true,
+        Range::Unspecified => full || planes == Planes::Grey,
+        Range::MPEG => full,
+    };
+    let matrix = Matrix::new(frame.color_space(), full);
     let plane = |i: usize| Plane { bytes: frame.data(i), stride: frame.stride(i) };
     let chroma_step = if matches!(planes, Planes::Grey | Planes::Bgrz) { 0 } else { 1 };
     convert(&matrix, planes, &[plane(0), plane(chroma_step), plane(2 * chroma_step)], width, out);

@@ -3,7 +3,7 @@
 
 use crate::colour;
 use crate::header;
-use crate::mp4::{Codec, Index};
+use crate::mp4::{Codec, Colours, Index};
 use crate::parameters::brings_parameters;
 use crate::reducer::Reducer;
 use crate::video::{Video, damaged};
@@ -80,7 +80,7 @@ impl DecoderPool {
             let (video, key) = (*video, *key);
             let mut decoder = self.take(video)?;
             let mut outcome = decoder.run(video, key, run);
-            // Not every frame that a file calls a key frame is one: others complete the pictures of a whole period. After a failure
+            // The nearest key frame may not be enough: with periodic refresh, frames are whole after a period only. After a failure
             // the state of the decoder is unknown, so the decoder is dropped.
             for earlier in EARLIER {
                 let (Err(_), Some(from)) = (&outcome, video.index.earlier_key(key, earlier)) else { break };
@@ -138,6 +138,7 @@ impl DecoderPool {
 struct Decoder {
     codec: Codec,
     extradata: Arc<[u8]>,
+    colours: Option<Colours>,
     size: (usize, usize),
     inner: decoder::Video,
     frame: frame::Video,
@@ -196,6 +197,7 @@ impl Decoder {
         Ok(Self {
             codec: index.codec,
             extradata: Arc::clone(&index.extradata),
+            colours: index.colours,
             size: (index.width, index.height),
             inner,
             frame: frame::Video::empty(),
@@ -206,6 +208,7 @@ impl Decoder {
 
     fn serves(&self, index: &Index) -> bool {
         self.codec == index.codec
+            && self.colours == index.colours
             && self.size == (index.width, index.height)
             && (Arc::ptr_eq(&self.extradata, &index.extradata) || self.extradata == index.extradata)
     }

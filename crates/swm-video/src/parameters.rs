@@ -9,13 +9,13 @@ pub fn brings_parameters(index: &Index, frame: &[u8]) -> bool {
     match (index.codec, index.extradata.first()) {
         (Codec::H264, Some(1)) => {
             let length = 1 + usize::from(index.extradata.get(4).unwrap_or(&3) & 3);
-            // Sequence and picture parameter sets, extensions and subsets of the former.
+            // Sequence and frame parameter sets, extensions and subsets of the former.
             units(frame, length)
                 .any(|unit| unit.first().is_some_and(|b| matches!(b & 31, 7 | 8 | 13 | 15)) && new(unit))
         }
         (Codec::Hevc, Some(1)) => {
             let length = 1 + usize::from(index.extradata.get(21).unwrap_or(&3) & 3);
-            // Video, sequence and picture parameter sets.
+            // Video, sequence and frame parameter sets.
             units(frame, length).any(|unit| unit.first().is_some_and(|b| matches!(b >> 1 & 63, 32..=34)) && new(unit))
         }
         // Without a record, parameters can stand among the frames only.
@@ -70,7 +70,7 @@ mod tests {
     fn index(codec: Codec, extradata: &[u8]) -> Index {
         let extradata = extradata.into();
         let (samples, frames, times) = (vec![], vec![], vec![]);
-        Index { codec, extradata, width: 8, height: 8, samples, frames, times, timescale: 1, sums: None }
+        Index { codec, extradata, colours: None, width: 8, height: 8, samples, frames, times, timescale: 1, sums: None }
     }
 
     #[test]

@@ -42,8 +42,8 @@ fn check(decoders: &DecoderPool, name: &str) {
 }
 
 #[test]
-fn deep_colours_and_open_groups_are_read() {
-    ["rgb", "grey", "open"].into_iter().for_each(|name| check(&DecoderPool::default(), name));
+fn colours_ranges_and_open_groups_are_read() {
+    ["rgb", "grey", "open", "box", "ffv1"].into_iter().for_each(|name| check(&DecoderPool::default(), name));
 }
 
 /// The parameters that a stream brings among its frames do not count for the next file, nor for its own first frames.
@@ -73,7 +73,7 @@ fn tables_that_contradict_the_stream_are_refused() {
     // Without the offsets from decoding to presentation, times are in decoding order.
     let video = opened(changed(whole.clone(), b"ctts", b"free")).expect("opening");
     let all: Vec<usize> = (0..video.frames()).collect();
-    let error = decode(&DecoderPool::default(), &video, &all).expect_err("frames at times of others").to_string();
+    let error = decode(&DecoderPool::default(), &video, &all).expect_err("frames at wrong times").to_string();
     assert!(error.contains("shows another frame"), "{error}");
     // A second description of the codec, and samples of it.
     let descriptions = after(&whole, b"stsd", 8);

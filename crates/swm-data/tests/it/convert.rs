@@ -380,3 +380,18 @@ fn dataset_is_not_written_over_itself() {
         assert_eq!(open(&path).expect("opening").episodes().len(), 2);
     }
 }
+
+/// The format refuses the name of a column only when it creates the table, below folders that exist then.
+#[test]
+fn a_conversion_that_is_refused_leaves_no_folder() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let schema = Schema::new([ColumnSpec::new("a`b", DType::Float32, [])]).expect("a schema");
+    let path = folder.path().join("from.h5");
+    let mut writer = create(&path, &schema, options(WriteMode::Create)).expect("creating the dataset");
+    writer.write_episode(&Batch::zeros(&schema, 3)).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    for name in ["to.lance", "to.lance-video"] {
+        run(&path, &folder.path().join(name), &lossless(ConvertMode::Create)).expect_err("a column with this name");
+        assert!(!folder.path().join(name).exists(), "{name} stays");
+    }
+}

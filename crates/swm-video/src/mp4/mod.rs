@@ -9,7 +9,7 @@ mod tables;
 use boxes::{Boxes, find, versioned};
 use std::ops::Range;
 use std::sync::Arc;
-use tables::{description, samples};
+use tables::{Description, description, samples};
 
 /// Limit of the size of a file's tables in bytes. The tables of an hour of video take less than a megabyte.
 const LARGEST_TABLES: u64 = 256 << 20;
@@ -40,12 +40,22 @@ pub struct Sample {
     pub key: bool,
 }
 
+/// What a file states of the colours of its frames, for streams that state nothing themselves (ISO/IEC 23091-2).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Colours {
+    /// The number of the matrix from RGB.
+    pub matrix: u16,
+    /// Whether values have the full range, if that is stated.
+    pub full: Option<bool>,
+}
+
 /// The video track of a file.
 #[derive(Clone, Debug)]
 pub struct Index {
     pub codec: Codec,
     /// Parameters of the decoder, from the file's sample entry.
     pub extradata: Arc<[u8]>,
+    pub colours: Option<Colours>,
     pub width: usize,
     pub height: usize,
     /// The samples, in decoding order.
@@ -146,15 +156,15 @@ impl Index {
         let timescale = timescale(find(mdia, b"mdhd")?.ok_or("has a track without a header")?)?;
         let minf = find(mdia, b"minf")?.ok_or("has a track without tables")?;
         let stbl = find(minf, b"stbl")?.ok_or("has a track without tables")?;
-        let (codec, extradata, width, height) =
-            description(find(stbl, b"stsd")?.ok_or("has a track without a codec")?)?;
+        let described = find(stbl, b"stsd")?.ok_or("has a track without a codec")?;
+        let Description { codec, extradata, colours, width, height } = description(described)?;
         let samples = samples(stbl, width * height, length)?;
         let edit = edit(trak, movie_scale, timescale)?;
         let mut frames: Vec<u32> = (0..u32::try_from(samples.len()).map_err(|e| e.to_string())?).collect();
         frames.retain(|&i| edit.shown.contains(&samples[i as usize].time));
         frames.sort_by_key(|&i| samples[i as usize].time);
         let times = frames.iter().map(|&i| samples[i as usize].time.saturating_add(edit.shift)).collect();
-        Ok(Self { codec, extradata, width, height, samples, frames, times, timescale, sums: None })
+        Ok(Self { codec, extradata, colours, width, height, samples, frames, times, timescale, sums: None })
     }
 
     /// Returns the key sample at which decoding of `sample` must begin: in decoding order, the last key sample up to

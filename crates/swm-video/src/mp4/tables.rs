@@ -1,11 +1,21 @@
 //! The tables of a track: the codec of its samples, and where and when each sample is.
 
 use super::boxes::{Boxes, find, versioned};
-use super::{Codec, Result, Sample};
+use super::{Codec, Colours, Result, Sample};
 use std::sync::Arc;
 
-/// Returns the codec, its decoder record, width and height.
-pub(super) fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
+/// How the samples of a track are encoded.
+pub(super) struct Description {
+    pub codec: Codec,
+    /// Parameters of the decoder.
+    pub extradata: Arc<[u8]>,
+    pub colours: Option<Colours>,
+    pub width: usize,
+    pub height: usize,
+}
+
+/// Reads the description of a track's samples.
+pub(super) fn description(stsd: &[u8]) -> Result<Description> {
     /// Size in bytes of a visual sample entry before its boxes.
     const ENTRY: usize = 78;
     /// Offset of the frame size in a visual sample entry.
@@ -32,7 +42,9 @@ pub(super) fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize
     let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("has a codec description that is cut short")?;
     let size = |at: usize| usize::from(u16::from_be_bytes([fixed[at], fixed[at + 1]]));
     // Ignores malformed boxes, because vendors add boxes in unknown forms.
-    let record = Boxes(boxes).flatten().find(|(kind, _)| kind == record).map_or(&[][..], |(_, body)| body);
+    let boxed = |kind: &[u8; 4]| Boxes(boxes).flatten().find(|(found, _)| found == kind).map(|(_, body)| body);
+    let record = boxed(record).unwrap_or_default();
+    let colours = boxed(b"colr").and_then(colours);
     // A decoder needs no record for VP9.
     let extradata = if codec == Codec::Vp9 { &[] } else { record };
     let (width, height) = (size(SIZE), size(SIZE + 2));
@@ -42,7 +54,18 @@ pub(super) fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize
     if width * height > swm_image::MAX_PIXELS {
         return Err(format!("has frames of {width} x {height} pixels, more than {}", swm_image::MAX_PIXELS));
     }
-    Ok((codec, extradata.into(), width, height))
+    Ok(Description { codec, extradata: extradata.into(), colours, width, height })
+}
+
+/// Reads a box of colours, which numbers primaries, transfer and matrix, and in its newer form states the range.
+fn colours(colr: &[u8]) -> Option<Colours> {
+    let (kind, [_, _, _, _, high, low, rest @ ..]) = colr.split_first_chunk::<4>()? else { return None };
+    let full = match kind {
+        b"nclx" => Some(rest.first()? & 128 != 0),
+        b"nclc" => None,
+        _ => return None,
+    };
+    Some(Colours { matrix: u16::from_be_bytes([*high, *low]), full })
 }
 
 /// The most encoded frames of a video: 38 hours at 60 frames per second. A few bytes of a file can state any number.

@@ -40,5 +40,12 @@ with tempfile.TemporaryDirectory() as folder:
     encode(second, "libx264", "yuv420p", "qp=38:cabac=0")
     listed.write_text(f"file {here / 'rare-first.mp4'}\nfile {second}\n")
     ffmpeg("-f", "concat", "-safe", "0", "-i", listed, "-c", "copy", here / "rare-joined.mp4")
-for name in ("rgb", "grey", "open", "first", "joined"):
+# Colours that only a box of the file states, and greys whose range nothing states.
+with tempfile.TemporaryDirectory() as folder:
+    plain = Path(folder, "plain.mp4")
+    encode(plain, "libx264", "yuv444p", "qp=10")
+    ffmpeg("-i", plain, "-c", "copy", "-color_range", "pc", "-colorspace", "bt709", "-movflags", "write_colr", here / "rare-box.mp4")
+ffv1 = ["-c:v", "ffv1", "-level", "3", "-g", "1", "-pix_fmt", "gray", "-f", "mov"]
+ffmpeg(*SIZE[:3], "testsrc2=size=64x48:rate=25:duration=0.2", *ffv1, here / "rare-ffv1.mp4")
+for name in ("rgb", "grey", "open", "first", "joined", "box", "ffv1"):
     frames(name)

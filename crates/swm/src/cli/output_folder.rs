@@ -55,7 +55,11 @@ fn delete_temporary_of_evaluation(folder: &Path) -> Result<()> {
     let staged_videos = staged.join("videos");
     if is_folder(&staged) && is_folder(&staged_videos) {
         files::delete_temporary(&staged_videos, is_video)?;
-        let is_own = |name: &PathBuf| name.to_str().is_some_and(|name| !name.contains('/') && is_video(name));
+        let is_own = |name: &PathBuf| {
+            let path = staged_videos.join(name);
+            let is_marked = swm_data::check_mp4(&path).is_ok() || swm_data::check_png(&path).is_ok();
+            is_marked && name.to_str().is_some_and(|name| !name.contains('/') && is_video(name))
+        };
         let names = files::list(&staged_videos)?.into_iter().filter(is_own);
         files::delete_named(&staged_videos, &names.collect::<Vec<_>>())?;
         files::remove_empty_folder(&staged_videos)?;

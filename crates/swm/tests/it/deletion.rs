@@ -178,6 +178,27 @@ fn previews_videos_and_images_do_not_replace_files_of_the_user() {
     }
 }
 
+/// An evaluation that is killed leaves videos in `.new`, which the next one deletes, and nothing else there.
+#[test]
+fn of_videos_that_waited_only_those_of_the_program_are_deleted() {
+    let swm = Swm::new();
+    let eval = ["eval", "random", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--budget", "5", "--videos", "1", "-o"];
+    let with = |output| [&eval[..], &[output]].concat();
+    swm.json(&with("out"));
+    assert!(!swm.path("out/.new").exists());
+    let files = ["out/.new/videos/holiday-2024.png", "out/.new/videos/cat-1.mp4"].map(|name| swm.path(name));
+    files.iter().for_each(|path| user_file(path));
+    let left = swm.path("out/.new/videos/random-in-distribution-7.mp4");
+    fs::copy(swm.path("out/videos/random-in-distribution-0.mp4"), &left).expect("copying");
+    swm.json(&with("out"));
+    files.iter().for_each(|path| assert_untouched(path));
+    assert!(!left.exists());
+    // A link would lead elsewhere.
+    fs::create_dir_all(swm.path("linked/.new")).expect("creating a folder");
+    std::os::unix::fs::symlink(swm.path("out"), swm.path("linked/.new/videos")).expect("making a link");
+    swm.fails(&with("linked"), 2, &["linked/.new/videos", "symbolic link"]);
+}
+
 #[test]
 fn what_a_kill_leaves_of_an_image_is_deleted_by_the_next_of_its_name() {
     let swm = Swm::new();

@@ -234,7 +234,7 @@ pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
         // No other program puts the root's B-tree at this address, which the superblock also contains.
         let address = ROOT + ROOT_BYTES + 8 + SPARE_BYTES as u64;
         if tree == address || read_u64(source, ROOT_TREE_AT)? == address {
-            return Err("the header of its root is damaged".to_owned());
+            return Err("the header of its root is damaged, or another program changed it".to_owned());
         }
         return Ok(None);
     }

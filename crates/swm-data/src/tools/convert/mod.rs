@@ -24,7 +24,7 @@ use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::thread::{Builder, scope};
 use swm_core::columns::ACTION;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{Batch, DType, Error, Result, Schema};
+use swm_core::{Batch, DType, Error, Result, Schema, files};
 use swm_image::ImageCodec;
 
 /// The unit of progress.
@@ -269,13 +269,16 @@ fn reopen(target: &Location, format: Option<&FormatEntry>) -> Result<Arc<dyn Rea
     format.map_or_else(|| open(target), |format| format.open(target))
 }
 
-/// Deletes a dataset on this machine without episodes, which a failed conversion leaves.
+/// Deletes a dataset on this machine without episodes, or the empty folders of one, which a failed conversion leaves.
 fn remove_if_empty(target: &Location, format: Option<&FormatEntry>) {
-    let Some((path, format)) = target.path().zip(format.or_else(|| detect(target))) else { return };
-    if !format.open(target).is_ok_and(|written| written.episodes().is_empty()) {
-        return;
-    }
-    if let Err(error) = format.remove(path) {
+    let Some(path) = target.path() else { return };
+    let removed = match format.or_else(|| detect(target)).map(|format| (format, format.open(target))) {
+        Some((format, Ok(written))) if written.episodes().is_empty() => format.remove(path),
+        Some((_, Ok(_))) => return,
+        _ if path.is_dir() && !path.is_symlink() => files::remove_empty_folders(path),
+        _ => return,
+    };
+    if let Err(error) = removed {
         tracing::warn!("an empty dataset could not be deleted: {error}");
     }
 }

@@ -116,6 +116,7 @@ def test_files_of_the_user_and_of_the_engine_are_not_replaced(home):
     model, folder = torch.nn.Linear(2, 2), home / "checkpoints/mine"
     folder.mkdir(parents=True)
     contents = {"model.pt": "a text", "config.json": '{"_target_": "mine"}', "thesis.txt": "a thesis"}
+    scripted = torch.jit.script(torch.nn.Linear(2, 2))
     for name, content in contents.items():
         (folder / name).write_text(content)
     for name in ("weights.pt", "model.pt", "thesis.txt"):
@@ -127,6 +128,13 @@ def test_files_of_the_user_and_of_the_engine_are_not_replaced(home):
     for name in ("config.json", "weights.safetensors", "../weights.pt", ""):
         with pytest.raises(ValueError, match="plain name"):
             save_pretrained(model, "new", config, filename=name)
+    torch.jit.save(scripted, folder / "scripted.pt")
+    with pytest.raises(FileExistsError, match="did not write"):
+        save_pretrained(model, "mine", config, filename="scripted.pt")
+    # Its own files are replaced, whatever the configuration.
+    for plain in ({"hidden": 3}, {}, [1, 2], config):
+        for _ in range(2):
+            save_pretrained(model, f"plain-{type(plain).__name__}-{len(plain)}", plain)
     (folder / "weights.safetensors").write_text("weights of the engine")
     with pytest.raises(FileExistsError, match="of the engine"):
         save_pretrained(model, "mine", filename="new.pt")

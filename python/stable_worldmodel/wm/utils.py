@@ -74,7 +74,9 @@ def save_pretrained(
     if config is None:
         warnings.warn(f"{folder}: saved without a config, so load_pretrained cannot build the model", stacklevel=2)
     else:
-        text = json.dumps(_plain(config[config_key] if config_key is not None and config_key in config else config), indent=2)
+        text = _text(_plain(config[config_key] if config_key is not None and config_key in config else config))
+        if len(text) > _MOST_SETTINGS:
+            raise ValueError(f"config: it has {len(text)} characters, more than the {_MOST_SETTINGS} that are read again")
         files[settings] = lambda beside: beside.write_text(text)
     _files.replace(files)
 
@@ -84,7 +86,9 @@ def _is_saved(file: Path) -> bool:
     if not file.is_file() or not zipfile.is_zipfile(file):
         return False
     with zipfile.ZipFile(file) as archive:
-        return any(name.endswith("/data.pkl") for name in archive.namelist())
+        names = {name.rpartition("/")[2] for name in archive.namelist()}
+    # An archive of TorchScript has constants as well.
+    return "data.pkl" in names and "constants.pkl" not in names
 
 
 def _saved(folder: Path) -> Iterator[Path]:
@@ -94,10 +98,14 @@ def _saved(folder: Path) -> Iterator[Path]:
 def _is_settings(file: Path) -> bool:
     """Whether a file holds the configuration of a model, as `save_pretrained` writes it."""
     try:
-        config = _read_settings(file)
+        return file.read_text() == _text(_read_settings(file))
     except (OSError, ValueError):
         return False
-    return isinstance(config, dict) and "_target_" in json.dumps(config)
+
+
+def _text(config: Any) -> str:
+    """The text of a configuration, as `save_pretrained` writes it."""
+    return json.dumps(config, indent=2)
 
 
 def _plain(config: Any) -> Any:

@@ -1,8 +1,8 @@
 //! A reader of a dataset that another process replaces never returns rows of both.
 
 use crate::fuzz::copy_all;
-use crate::sample::{check, episode, write};
-use swm_data::{Mark, Reader, StepRange, WriteMode, open};
+use crate::sample::{check, episode, manifest, options, schema, write};
+use swm_data::{Mark, Reader, StepRange, WriteMode, WriteOptions, create, open};
 
 /// The formats whose readers open files by name when they are needed.
 const FORMATS: [&str; 3] = ["folder", "video", "lerobot"];
@@ -80,6 +80,26 @@ fn a_reader_of_a_dataset_that_grows_reads_on() {
         let grown = open(&path).expect("opening the dataset");
         write(&path, WriteMode::Overwrite, 3, 0..9);
         assert!(first_rows(&*grown, "action").is_err(), "{format}");
+    }
+}
+
+/// A collection that is continued changes the manifest.
+#[test]
+fn a_reader_that_has_read_nothing_reads_on_when_the_dataset_grows() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "h5", "folder", "video", "lerobot"] {
+        let path = folder.path().join(format!("d.{format}"));
+        write(&path, WriteMode::Create, 3, 0..6);
+        let readers = [(); 2].map(|()| open(&path).expect("opening the dataset"));
+        first_rows(&*readers[1], "pixels").expect("a column");
+        let grown = WriteOptions { manifest: Some(manifest(4)), ..options(WriteMode::Append) };
+        let mut writer = create(&path, &schema(), grown).expect("continuing");
+        (6..150).for_each(|e| writer.write_episode(&episode(e)).expect("writing"));
+        writer.finish().expect("finishing");
+        for reader in &readers {
+            check(&**reader, 0);
+            assert_eq!(reader.episodes().len(), 6, "{format}");
+        }
     }
 }
 

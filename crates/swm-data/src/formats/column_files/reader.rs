@@ -26,6 +26,8 @@ pub(crate) struct ColumnFiles {
     /// Constants of the episodes that are in the journal but not yet in the column files.
     pending_constants: Vec<Constants>,
     opened: Opened,
+    /// [`Self::identity`] when the dataset was opened, if it could be read and there were rows in the files.
+    first_rows: Option<String>,
 }
 
 struct Column {
@@ -69,7 +71,9 @@ impl ColumnFiles {
                 .for_each(|(column, unmerged_rows)| column.unmerged_rows.extend(unmerged_rows));
             pending_constants.push(constants);
         }
-        let files = Self { folder: folder.to_owned(), rows, recorded, columns, skipped, pending_constants, opened };
+        let folder = folder.to_owned();
+        let mut files = Self { folder, rows, recorded, columns, skipped, pending_constants, opened, first_rows: None };
+        files.first_rows = (in_files > 0).then(|| files.identity().ok()).flatten();
         // All that was read so far is of one dataset.
         files.check()?;
         Ok(files)
@@ -84,7 +88,7 @@ impl ColumnFiles {
     }
 
     /// Whether the dataset in the folder is this one, or has grown from it. A program that replaces files by itself counts no
-    /// replacement: the columns that were read so far are compared, or the manifests if none was.
+    /// replacement: the columns that were read so far are compared, or the manifests and first rows if none was.
     fn is_same(&self) -> Result<bool> {
         let (lengths, now) = stored_metadata(&self.folder)?;
         let own = self.rows.episodes()[..self.episodes_in_files()].iter().map(|episode| episode.length as i64);
@@ -93,7 +97,8 @@ impl ColumnFiles {
         }
         let mut read = self.columns.iter().filter_map(|column| Some((column, column.data.get()?))).peekable();
         if read.peek().is_none() {
-            return Ok(now.manifest.is_some() && now.manifest == self.recorded.manifest);
+            let is_recorded = now.manifest.is_some() && now.manifest == self.recorded.manifest;
+            return Ok(is_recorded || (self.first_rows.is_some() && self.first_rows == self.identity().ok()));
         }
         for (column, data) in read {
             let in_file = column.in_file * column.spec.row_bytes();

@@ -178,7 +178,9 @@ fn block(file: &ObjectFile, blocks: &Mutex<Blocks>, index: u64) -> Result<Bytes>
 }
 
 impl hdf5_pure::Source for Source {
+    /// The present size: a writer may append what the structure of the file names next.
     fn len(&self) -> u64 {
+        self.reaches(u64::MAX);
         self.size()
     }
 

@@ -322,12 +322,15 @@ class World:
         Args:
             steps: The number of steps. With a policy of the engine, all steps run in one call of the engine.
         """
-        if self.policy is None:
+        policy = self.policy
+        if policy is None:
             raise RuntimeError("World.step: no policy; call set_policy first")
         steps = 1 if steps == 1 else _options.count("steps", steps, 0)
         if self.seed is None:
             self.reset()
-        actor = self._actor(self.policy)
+        # A call is a few microseconds long: nothing here is called without need.
+        known = self._actors.get(id(policy))
+        actor = known[1] if known is not None and known[0] is policy else self._actor(policy)
         if actor is not None and isinstance(self._reset_text, str):
             begun, self._next_episode = self._world.play(actor, steps, self.seed or 0, self._next_episode, self._reset_text)
             for slot, episode in begun:
@@ -335,7 +338,8 @@ class World:
             if begun:
                 self._show_factors([slot for slot, _ in begun])
             self._fresh.fill(False)
-            self._transform()
+            if self._frames:
+                self._transform()
             return
         for _ in range(steps):
             over = self.terminateds | self.truncateds

@@ -80,9 +80,9 @@ impl DecoderPool {
             let (video, key) = (*video, *key);
             let mut decoder = self.take(video)?;
             let mut outcome = decoder.run(video, key, run);
-            // The nearest key frame may not be enough: with periodic refresh, frames are whole after a period only. After a failure
-            // the state of the decoder is unknown, so the decoder is dropped.
-            for earlier in EARLIER {
+            // The nearest key frame may not be enough: with periodic refresh, frames are whole after a period only. Videos of this
+            // program have closed groups. After a failure the state of the decoder is unknown, so the decoder is dropped.
+            for earlier in EARLIER.into_iter().filter(|_| video.index.sums.is_none()) {
                 let (Err(_), Some(from)) = (&outcome, video.index.earlier_key(key, earlier)) else { break };
                 decoder = Decoder::new(video)?;
                 outcome = decoder.run(video, from, run);

@@ -205,7 +205,7 @@ _NUMERIC = frozenset("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 flo
 
 
 def _numbers(name: str, item: Any) -> Array:
-    """The array that `_described` stored. A file of somebody else can state any type and any values."""
+    """The array that `_described` stored. A third-party file can state any type and any values."""
     dtype, values = (item.get("dtype"), item.get("values")) if isinstance(item, dict) else (None, None)
     if not isinstance(dtype, str) or dtype not in _NUMERIC:
         raise ValueError(f"{EPISODE}[{name!r}]: expected text, or values of a numeric type, got the type {str(dtype)[:40]!r}")

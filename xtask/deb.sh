@@ -36,10 +36,11 @@ install -m 644 "$FOLDER/CHANGES.md" "$DOC/CHANGES.md"
 } > "$DOC/changelog"
 gzip -9 --no-name "$DOC/changelog" "$DOC/CHANGES.md" "$ROOT"/usr/share/man/man1/*.1
 
-# The libraries that the program is linked with, as packages of this release of Debian.
+# The libraries that the program is linked with, as packages of this release of Debian, and FFmpeg's, which it loads when it needs them.
 mkdir -p "$WORK/debian" "$ROOT/DEBIAN"
 printf 'Source: %s\n\nPackage: %s\nArchitecture: %s\n' "$NAME" "$NAME" "$ARCH" > "$WORK/debian/control"
-DEPENDS=$(cd "$WORK" && dpkg-shlibdeps -O root/usr/bin/swm | sed -n 's/^shlibs:Depends=//p')
+echo 'int main(void) { return 0; }' | cc -x c - -o "$WORK/ffmpeg" -Wl,--no-as-needed -lavformat -lavcodec -lavutil -lswscale
+DEPENDS=$(cd "$WORK" && dpkg-shlibdeps -O root/usr/bin/swm ffmpeg | sed -n 's/^shlibs:Depends=//p')
 cat > "$ROOT/DEBIAN/control" <<EOF
 Package: $NAME
 Version: $VERSION

@@ -25,6 +25,9 @@ def main() -> None:
     begun = time.perf_counter()
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32))
     print(f"the first world: {1e3 * (time.perf_counter() - begun):.0f} ms more")
+    # The portable wheel is linked with a small FFmpeg of its own; elsewhere its libraries are loaded for the first video.
+    bundled = Path(swm.__file__).parents[1] / "stable_worldmodel_rs.libs"
+    assert bundled.exists() or "libavcodec" not in Path("/proc/self/maps").read_text()
     world.set_policy(swm.policy.ExpertPolicy())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rooms.lance"

@@ -1,9 +1,8 @@
 //! MuJoCo's library, loaded when the first environment needs it.
 //!
-//! `mujoco-rs` declares MuJoCo's functions as symbols for the linker. This module defines them as trampolines: one jump
-//! each, through a table that [`load`] fills from `libmujoco` of the installed assets. A program with this crate
-//! therefore starts where MuJoCo is not installed, and only the environments of this crate fail there. A call before
-//! loading calls [`not_loaded`].
+//! `mujoco-rs` declares MuJoCo's functions as symbols for the linker. This module defines them as trampolines to `libmujoco` of the
+//! installed assets, which [`load`] loads. A program with this crate therefore starts where MuJoCo is not installed, and only
+//! the environments of this crate fail there.
 //!
 //! The module also replaces MuJoCo's error handling. By default MuJoCo writes errors to `MUJOCO_LOG.TXT` in the working
 //! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to
@@ -18,93 +17,27 @@ use mujoco_rs::mujoco_c::mjtLogLevel;
 use std::cell::Cell;
 use std::ffi::{CStr, c_char, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
-use std::sync::OnceLock;
 use swm_core::{Error, Result};
+use swm_dlopen::Once;
 
 /// The version of MuJoCo that is loaded. No other version works: `mujoco-rs` declares the structures of this version.
 pub const VERSION: &str = "3.17.0";
 
 macro_rules! trampolines {
     ($($name:ident)*) => {
-        /// The names of the functions, in the order of the table.
-        const NAMES: &[&CStr] = &[$(
-            match CStr::from_bytes_with_nul(concat!(stringify!($name), "\0").as_bytes()) {
-                Ok(name) => name,
-                Err(_) => panic!("a name for MuJoCo must not contain a zero byte"),
-            }
-        ),*];
-
-        // Each function jumps to the address in its entry of the table; entries are in the order of the names.
-        std::arch::global_asm!(
-            ".pushsection .data.swm_mujoco_table,\"aw\",%progbits",
-            ".balign 8",
-            ".hidden swm_mujoco_table",
-            ".globl swm_mujoco_table",
-            "swm_mujoco_table:",
-            ".popsection",
-            $(
-                ".pushsection .data.swm_mujoco_table,\"aw\",%progbits",
-                "22:",
-                ".quad {not_loaded}",
-                ".popsection",
-                ".pushsection .text.swm_mujoco,\"ax\",%progbits",
-                concat!(".hidden ", stringify!($name)),
-                concat!(".globl ", stringify!($name)),
-                concat!(".type ", stringify!($name), ",%function"),
-                concat!(stringify!($name), ":"),
-                jump!(),
-                ".popsection",
-            )*
-            not_loaded = sym not_loaded,
-        );
-    };
-}
-
-#[cfg(target_arch = "x86_64")]
-macro_rules! jump {
-    () => {
-        "jmp qword ptr [rip + 22b]"
-    };
-}
-
-#[cfg(target_arch = "aarch64")]
-macro_rules! jump {
-    () => {
-        "adrp x16, 22b\nldr x16, [x16, :lo12:22b]\nbr x16"
+        swm_dlopen::functions! { swm_mujoco_table: $($name)* }
     };
 }
 
 symbols::each_symbol!(trampolines);
-
-unsafe extern "C" {
-    /// Addresses of the functions of [`NAMES`]; written once, by [`open`].
-    static mut swm_mujoco_table: [*const (); NAMES.len()];
-}
-
-/// The target of every trampoline before [`load`]. Reaching it is a bug of this crate, which must load the library
-/// first.
-extern "C" fn not_loaded() -> ! {
-    tracing::error!("a MuJoCo function was called before MuJoCo was loaded");
-    std::process::abort();
-}
 
 /// Loads MuJoCo's library on the first call; later calls do nothing. MuJoCo's functions may be called afterwards.
 ///
 /// # Errors
 /// When MuJoCo is not installed (the error names the command to install it), or its library cannot be loaded.
 pub fn load() -> Result<()> {
-    static LOADED: OnceLock<()> = OnceLock::new();
-    if LOADED.get().is_some() {
-        return Ok(());
-    }
-    // Concurrent callers wait for the first caller; after a failure, the next call tries again.
-    static LOADING: std::sync::Mutex<()> = std::sync::Mutex::new(());
-    let _lock = LOADING.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    if LOADED.get().is_none() {
-        open()?;
-        LOADED.get_or_init(|| ());
-    }
-    Ok(())
+    static LOADED: Once = Once::new();
+    LOADED.run(open)
 }
 
 /// Opens the library, fills the table, and installs the log handler.
@@ -113,18 +46,14 @@ fn open() -> Result<()> {
     let failed = |error: libloading::Error| Error::external(format!("loading {}", path.display()), error);
     // SAFETY: MuJoCo's library has no initialisers with side effects; its SHA-256 was checked at installation.
     let library = unsafe { Library::open(Some(&path), RTLD_NOW | RTLD_LOCAL) }.map_err(failed)?;
-    let mut table = [std::ptr::null(); NAMES.len()];
-    for (entry, name) in table.iter_mut().zip(NAMES) {
-        // SAFETY: only the address is taken; `mujoco-rs` declares the signature of the function.
-        *entry = *unsafe { library.get::<*const ()>(name.to_bytes_with_nul()) }.map_err(failed)?;
+    // SAFETY: `mujoco-rs` declares the signatures of this version's functions. `load` calls this function under a lock, and no function
+    // of the table is called before it returns.
+    unsafe {
+        fill(|name| library.get::<*const ()>(name.to_bytes_with_nul()).map(|address| Some(*address)).map_err(failed))?;
+        mju_setLogHandler(Some(on_message));
     }
     // Unloading would invalidate the addresses in the table.
     std::mem::forget(library);
-    // SAFETY: `load` calls this function under a lock, and no function of the table is called before it returns.
-    unsafe {
-        (&raw mut swm_mujoco_table).write(table);
-        mju_setLogHandler(Some(on_message));
-    }
     Ok(())
 }
 

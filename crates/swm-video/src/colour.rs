@@ -283,6 +283,7 @@ mod tests {
 
     #[test]
     fn colours_are_close_after_a_round_trip() {
+        crate::link::load().expect("FFmpeg");
         for (format, width, height, tolerance) in
             [(Pixel::YUV444P, 71, 33, 2), (Pixel::YUV420P, 70, 34, 4), (Pixel::YUV444P, 1, 1, 2)]
         {
@@ -303,6 +304,7 @@ mod tests {
 
     #[test]
     fn red_converts_as_in_bt601_and_bt709() {
+        crate::link::load().expect("FFmpeg");
         // Red in BT.601 and BT.709, 16 to 235: ITU-R BT.601-7 and BT.709-6.
         for (space, [y, u, v]) in [(Space::Unspecified, [81, 90, 240]), (Space::BT709, [63, 102, 240])] {
             let mut frame = frame::Video::new(Pixel::YUV444P, 2, 1);

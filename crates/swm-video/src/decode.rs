@@ -3,6 +3,7 @@
 
 use crate::colour;
 use crate::header;
+use crate::link;
 use crate::mp4::{Codec, Colours, Index};
 use crate::parameters::brings_parameters;
 use crate::reducer::Reducer;
@@ -161,7 +162,7 @@ struct Run<'a, 'b> {
 impl Decoder {
     fn new(video: &Video) -> Result<Self> {
         let index = &video.index;
-        crate::prepare();
+        link::load()?;
         let id = match index.codec {
             Codec::H264 => codec::Id::H264,
             Codec::Hevc => codec::Id::HEVC,

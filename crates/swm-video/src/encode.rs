@@ -1,8 +1,7 @@
 //! Encoding of frames as an MP4 file: H.264 by x264, or by OpenH264 where FFmpeg was built without parts under the GPL; lossless
 //! frames then as FFV1.
 
-use crate::colour;
-use crate::mp4;
+use crate::{colour, link, mp4};
 use ffmpeg_next::codec::{self, Flags, threading};
 use ffmpeg_next::color::{Range, Space};
 use ffmpeg_next::format::{self, Pixel};
@@ -182,7 +181,7 @@ impl Encoder {
     /// # Errors
     /// When FFmpeg lacks an encoder of this quality, or the encoder refuses the settings.
     pub fn new(width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
-        crate::prepare();
+        link::load()?;
         let candidates = encoding.candidates(width, height);
         let Some(settings) = candidates.iter().find(|settings| encoder::find_by_name(settings.encoder).is_some())
         else {
@@ -358,7 +357,7 @@ mod tests {
             assert_eq!(size, (height, width));
             assert!(frames == test_frames(width, height), "{width} x {height}");
         }
-        crate::prepare();
+        link::load().expect("FFmpeg");
         let encoding = Encoding::training(ImageCodec::Qoi);
         let refused = Encoder::with(&Settings::ffv1(1, 5), 1, 5, 25, encoding).err().map(|error| error.to_string());
         assert!(refused.is_some_and(|error| error.contains("1 x 5 pixels")));
@@ -366,7 +365,7 @@ mod tests {
 
     #[test]
     fn open_h264_is_close_and_enlarges_odd_sizes() {
-        crate::prepare();
+        link::load().expect("FFmpeg");
         if encoder::find_by_name("libopenh264").is_none() {
             return;
         }

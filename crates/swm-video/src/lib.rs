@@ -12,6 +12,7 @@ mod colour;
 mod decode;
 mod encode;
 mod header;
+mod link;
 mod mp4;
 mod parameters;
 #[cfg(test)]
@@ -29,14 +30,4 @@ use std::path::Path;
 /// Returns whether this program wrote a video file: whether it has checksums of its frames.
 pub fn is_own(path: &Path) -> bool {
     Video::open(Source::File(path.to_owned())).is_ok_and(|video| video.index.sums.is_some())
-}
-
-/// Initialises FFmpeg's libraries once. FFmpeg logs nothing to standard error, because failures become errors.
-fn prepare() {
-    static ONCE: std::sync::Once = std::sync::Once::new();
-    ONCE.call_once(|| {
-        // Initialisation only registers error messages and cannot fail.
-        let _ = ffmpeg_next::init();
-        ffmpeg_next::log::set_level(ffmpeg_next::log::Level::Quiet);
-    });
 }

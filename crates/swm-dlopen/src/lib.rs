@@ -4,6 +4,7 @@
 //! library is loaded. A program therefore starts without the library, and as fast as if it did not use it. [`Once`] loads
 //! once, and again after a failure.
 
+use std::error::Error;
 use std::ffi::CStr;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
@@ -103,6 +104,15 @@ pub extern "C" fn not_loaded() -> ! {
     panic!("a function of a C library was called before the library was loaded; please report this as a bug");
 }
 
+/// Returns what the system says of a library that cannot be loaded, which is the last cause of `error`.
+pub fn reason(error: &dyn Error) -> String {
+    let mut last = error;
+    while let Some(cause) = last.source() {
+        last = cause;
+    }
+    last.to_string()
+}
+
 /// Something that is done once. After a failure, the next call tries again.
 #[derive(Debug, Default)]
 pub struct Once {
@@ -136,7 +146,7 @@ impl Once {
 #[cfg(test)]
 #[allow(unsafe_code, reason = "the functions are foreign")]
 mod tests {
-    use super::Once;
+    use super::{Once, reason};
 
     functions! { swm_dlopen_test_table: swm_dlopen_first swm_dlopen_second swm_dlopen_missing }
 
@@ -166,6 +176,13 @@ mod tests {
             (swm_dlopen_first(2, 0.5), swm_dlopen_second(41))
         };
         assert_eq!(results, (2.5, 42));
+    }
+
+    #[test]
+    fn reason_is_what_the_system_says() {
+        let cause = std::io::Error::other("libx.so.1: cannot open shared object file");
+        let error = std::io::Error::other(std::io::Error::other(cause));
+        assert_eq!(reason(&error), "libx.so.1: cannot open shared object file");
     }
 
     #[test]

@@ -18,7 +18,7 @@ use std::cell::Cell;
 use std::ffi::{CStr, c_char, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use swm_core::{Error, Result};
-use swm_dlopen::Once;
+use swm_dlopen::{Once, reason};
 
 /// The version of MuJoCo that is loaded. No other version works: `mujoco-rs` declares the structures of this version.
 pub const VERSION: &str = "3.17.0";
@@ -43,7 +43,7 @@ pub fn load() -> Result<()> {
 /// Opens the library, fills the table, and installs the log handler.
 fn open() -> Result<()> {
     let path = assets::path("mujoco")?.join(format!("mujoco/libmujoco.so.{VERSION}"));
-    let failed = |error: libloading::Error| Error::external(format!("loading {}", path.display()), error);
+    let failed = |error: libloading::Error| Error::external(format!("loading {}", path.display()), reason(&error));
     // SAFETY: MuJoCo's library has no initialisers with side effects; its SHA-256 was checked at installation.
     let library = unsafe { Library::open(Some(&path), RTLD_NOW | RTLD_LOCAL) }.map_err(failed)?;
     // SAFETY: `mujoco-rs` declares the signatures of this version's functions. `load` calls this function under a lock, and no function

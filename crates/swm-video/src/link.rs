@@ -9,7 +9,7 @@ use ffmpeg_next::ffi;
 use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
 use std::ffi::{CStr, CString, c_int};
 use swm_core::{Error, Result};
-use swm_dlopen::Once;
+use swm_dlopen::{Once, reason};
 
 swm_dlopen::functions! { swm_video_table:
     av_codec_is_decoder av_codec_is_encoder av_dict_free av_dict_set av_frame_alloc av_frame_free av_frame_get_buffer av_free av_freep
@@ -81,15 +81,22 @@ fn open_library((library, version): (&str, c_int)) -> Result<Library> {
     let file = format!("lib{library}.so.{version}");
     // SAFETY: FFmpeg's libraries have no initialisers with side effects; where they are found is up to the user's system.
     unsafe { Library::open(Some(&file), RTLD_NOW | RTLD_LOCAL) }.map_err(|error| {
-        let problem =
-            format!("{file} is missing or cannot be loaded ({error}); install FFmpeg's libraries of this version");
-        Error::external("loading FFmpeg for a video", problem)
+        let problem = format!("{}; install FFmpeg's libraries of this version", reason(&error));
+        Error::external(format!("loading {file} for a video"), problem)
     })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn missing_library_is_an_error_that_names_it() {
+        let error = open_library(("swm-missing", 1)).err().map(|error| error.to_string()).unwrap_or_default();
+        for part in ["libswm-missing.so.1 for a video", "No such file", "install FFmpeg's libraries"] {
+            assert!(error.contains(part), "{error}");
+        }
+    }
 
     /// Frames are decoded and encoded in the other tests of this crate; this one finds what the list lacks.
     #[test]

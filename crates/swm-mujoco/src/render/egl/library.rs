@@ -5,6 +5,7 @@
 use libloading::os::unix::{Library as SharedObject, RTLD_GLOBAL, RTLD_NOW};
 use std::ffi::{CStr, c_char, c_int, c_void};
 use swm_core::{Error, Result};
+use swm_dlopen::reason;
 
 type Pointer = *mut c_void;
 type Bool = u32;
@@ -65,7 +66,7 @@ impl Library {
     /// When the library is not installed.
     pub fn open() -> Result<Self> {
         let name = std::env::var("SWM_EGL_LIBRARY").unwrap_or_else(|_| "libEGL.so.1".to_owned());
-        let failed = |error: libloading::Error| Error::external(format!("opening {name}"), error);
+        let failed = |error: libloading::Error| Error::external(format!("opening {name}"), reason(&error));
         // SAFETY: loading EGL runs the initialisers of a system library.
         let shared = unsafe { SharedObject::open(Some(&name), RTLD_NOW | RTLD_GLOBAL) }.map_err(failed)?;
         // SAFETY: the field types are the signatures of the EGL specification.

@@ -277,6 +277,8 @@ class MPCPolicy(BasePolicy):
     """
 
     type = "world_model"
+    #: Planned in Python, it has the plans of the environments of one world, that of the last `set_policy`.
+    _of_one_world = True
 
     def __init__(
         self,

@@ -229,6 +229,20 @@ def test_masks_and_fractions_are_no_indices(tmp_path):
         buffer.sample(3)
 
 
+@pytest.mark.parametrize("kind", [data.MergeDataset, data.ConcatDataset])
+def test_datasets_with_other_clips_are_not_joined(kind, tmp_path):
+    for name in "ab":
+        with data.EpisodeWriter(tmp_path / f"{name}.h5", mode="overwrite") as writer:
+            writer.write_episode({name: np.arange(12)})
+    loaded = [("a", 2, 3), ("b", 3, 2), ("b", 2, 1)]
+    a, *others = (
+        data.load_dataset(str(tmp_path / f"{name}.h5"), num_steps=steps, frameskip=skip) for name, steps, skip in loaded
+    )
+    for other in others:
+        with pytest.raises(ValueError, match="the same num_steps and frameskip, got"):
+            kind([a, other])
+
+
 def test_scalers_normalise_and_invert(tmp_path):
     write(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance", num_steps=3, frameskip=2, backend="numpy")

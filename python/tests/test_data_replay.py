@@ -1,6 +1,7 @@
 """Tests of the replay buffer: the latest episodes, and samples that depend on seed and step."""
 
 import copy
+import pickle
 import sys
 import threading
 
@@ -116,3 +117,19 @@ def test_episodes_are_whole_while_another_thread_writes():
         writer.join()
         sys.setswitchinterval(interval)
     assert buffer.num_episodes_added == 3001
+
+
+def test_goals_of_a_buffer_are_those_of_its_content_now():
+    buffer = data.ReplayBuffer(max_steps=24, history_len=2)
+    for number, length in enumerate([6, 6, 12, 6, 7]):
+        buffer.write_episode({"episode": np.full(length, number), "t": np.arange(length)})
+        if number == 2:
+            goals = data.GoalDataset(
+                buffer, goal_probabilities=(0, 1, 0, 0), goal_keys={"episode": "goal_episode", "t": "goal_t"}, seed=1
+            )
+        if number < 2:
+            continue
+        assert len(goals) == sum(int(length) - 2 for length in buffer.lengths)
+        for sample in (goals[i] for i in range(len(goals))):
+            assert sample["goal_episode"][0] == sample["episode"][0] and sample["goal_t"][0] > sample["t"][-1]
+    assert len(pickle.loads(pickle.dumps(goals))) == len(goals)

@@ -66,6 +66,19 @@ def test_scalers_take_tensors():
     assert data.PercentileScaler(q_low=[0.0], q_high=[4.0])(torch.tensor([[9.0], [1.0]])).tolist() == [[1.0], [-0.5]]
 
 
+def test_scalers_of_many_rows_and_half_precision():
+    column = np.random.default_rng(0).normal(300, 1, (2_000_000, 1)).astype(np.float32)
+    scaler = data.ZScoreScaler().fit(column)
+    assert scaler.mean.dtype == np.float32 and abs(scaler.mean.item() - 300) < 0.01 and abs(scaler.std.item() - 1) < 0.01
+    halves = np.full((5, 1), 300, np.float16)
+    scaled = data.ZScoreScaler().fit(halves).transform(torch.as_tensor(halves))
+    assert scaled.dtype == torch.float16 and not scaled.any()
+    halves = np.array([[300.0], [-300.0]], np.float16)
+    assert data.ZScoreScaler().fit(halves).std.item() == 300
+    with pytest.raises(ValueError, match="1 of 2 rows have an infinite number"):
+        data.ZScoreScaler().fit(np.array([[1.0], [np.inf]]))
+
+
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int32, torch.int64, torch.bool])
 @pytest.mark.parametrize("method", ["zscore", "percentile"])
 def test_scalers_take_tensors_of_integers(method, dtype):

@@ -566,3 +566,23 @@ def test_plans_on_gpu_and_cpu_agree():
     for solver, model in kinds:
         on = [plan(few(solver, model.to(device), device=device)) for device in ("cpu", "cuda")]
         assert np.allclose(*on, atol=1e-4)
+
+
+def test_policy_planned_in_python_belongs_to_the_world_that_took_it_last():
+    class Still:
+        def configure(self, **settings):
+            self.envs = settings["n_envs"]
+
+        def solve(self, infos, init_action=None):
+            return {"actions": torch.zeros(self.envs, 4, 2)}
+
+    policy = swm.policy.MPCPolicy(Still(), swm.policy.PlanConfig(horizon=4, receding_horizon=4))
+    worlds = [swm.World("swm/TwoRoom-v1", num_envs=1, add_pixels=False) for _ in range(2)]
+    for world in worlds:
+        world.set_policy(policy)
+        world.reset(seed=0)
+    worlds[1].step()
+    with pytest.raises(RuntimeError, match="MPCPolicy: another world took the policy"):
+        worlds[0].step()
+    worlds[0].set_policy(policy)
+    worlds[0].step()

@@ -111,6 +111,21 @@ def test_configurations_of_many_modules_or_without_memory_are_refused(home):
         load_pretrained("many")
 
 
+def test_numbers_that_no_file_of_weights_needs_are_refused(home):
+    """Each takes gigabytes before there is a tensor, or in a frame that only finds a size."""
+    attention = {"_target_": "stable_worldmodel.wm.gcrl.module.Attention", "dim": 1, "heads": 1, "dim_head": 1}
+    save_pretrained(torch.nn.Linear(2, 2), "frames", {**attention, "num_frames": 2_000_000_000})
+    with pytest.raises(ValueError, match="the number 2000000000"):
+        load_pretrained("frames")
+    small = {"mlp_dim": 1, "num_bins": 2, "enc_dim": 1, "num_q": 1, "vmin": -1, "vmax": 1, "simnorm_dim": 8}
+    sizes = {"action_dim": 1, "image_size": 30_000, "wm": {"encoding": {"pixels": 0, "x": 8}, **small}, "extra_dims": {"x": 1}}
+    save_pretrained(torch.nn.Linear(2, 2), "side", {"_target_": "stable_worldmodel.wm.tdmpc2.tdmpc2.TDMPC2", "cfg": sizes})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises((ValueError, RuntimeError)):
+        load_pretrained("side")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20  # KiB
+
+
 def test_files_of_the_user_and_of_the_engine_are_not_replaced(home):
     config = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 2}
     model, folder = torch.nn.Linear(2, 2), home / "checkpoints/mine"
@@ -131,6 +146,23 @@ def test_files_of_the_user_and_of_the_engine_are_not_replaced(home):
     torch.jit.save(scripted, folder / "scripted.pt")
     with pytest.raises(FileExistsError, match="did not write"):
         save_pretrained(model, "mine", config, filename="scripted.pt")
+    # Those of a training script of the user: neither its settings nor its weights.
+    script = home / "checkpoints/script"
+    script.mkdir()
+    settings = json.dumps({**config, "notes": "the only copy"}, indent=2)
+    (script / "config.json").write_text(settings)
+    torch.save({"step": 7}, script / "weights.pt")
+    before = (script / "weights.pt").read_bytes()
+    for name in ("weights.pt", "other.pt"):
+        with pytest.raises(FileExistsError, match="did not write"):
+            save_pretrained(model, "script", config, filename=name)
+    assert (script / "config.json").read_text() == settings and (script / "weights.pt").read_bytes() == before
+    # Nor its own configuration after a change.
+    save_pretrained(model, "changed", config)
+    changed = home / "checkpoints/changed/config.json"
+    changed.write_text(changed.read_text().replace("2", "3"))
+    with pytest.raises(FileExistsError, match="did not write"):
+        save_pretrained(model, "changed", config)
     # Its own files are replaced, whatever the configuration.
     for plain in ({"hidden": 3}, {}, [1, 2], config):
         for _ in range(2):

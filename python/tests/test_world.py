@@ -261,6 +261,72 @@ def test_python_function_and_schedule_give_equal_frames():
         rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: 250.0 + step)])
 
 
+def test_list_of_seeds_decides_policies_and_later_episodes():
+    runs = []
+    for _ in range(2):
+        world = swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False, max_episode_steps=3)
+        world.set_policy(swm.policy.RandomPolicy(seed=3))
+        world.reset(seed=[11, 12])
+        assert world.envs.seeds.tolist() == [11, 12]
+        world.step(9)
+        assert not {11, 12} & set(world.envs.seeds.tolist())
+        runs.append((world.infos["action"].copy(), world.infos["state"].copy(), world.envs.seeds))
+    for first, second in zip(*runs, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+class Within:
+    """A user's policy around one of the engine."""
+
+    def __init__(self, inner):
+        self.inner = inner
+
+    def set_env(self, env):
+        self.inner.set_env(env)
+
+    def get_action(self, infos):
+        return self.inner.get_action(infos)
+
+
+def test_policy_within_another_is_refused_by_evaluate_with_the_reason():
+    world = swm.World("swm/TwoRoom-v1", num_envs=1, add_pixels=False, max_episode_steps=5)
+    world.set_policy(Within(swm.policy.RandomPolicy(seed=1)))
+    with pytest.raises(RuntimeError, match=r"RandomPolicy: .* acts in World\.step only; .* MixturePolicy"):
+        world.evaluate(episodes=1, seed=0)
+    world.reset(seed=0)
+    world.step(3)
+
+
+def test_policy_within_another_begins_every_episode():
+    played = {}
+    for within in (False, True):
+        world = swm.World("swm/PushT-v1", num_envs=1, add_pixels=False, max_episode_steps=20)
+        policy = swm.policy.ExpertPolicy()
+        world.set_policy(Within(policy) if within else policy)
+        for episode in range(2):
+            world.reset(seed=8)
+            actions = []
+            for _ in range(45):
+                world.step()
+                actions.append(world.infos["action"].copy())
+            played[within, episode] = np.stack(actions)
+    for key in played:
+        np.testing.assert_array_equal(played[key], played[False, 0], str(key))
+
+
+def test_restored_snapshot_refreshes_infos():
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16), image_transform=np.asarray)
+    world.reset(seed=1, options={"variation": ["all"]})
+    state, before = world.snapshot(1), {key: np.copy(value) for key, value in world.infos.items()}
+    world.reset(seed=9, options={"variation": ["all"]})
+    other = {key: np.copy(value) for key, value in world.infos.items()}
+    world.restore(state, 1)
+    for key in ("pixels", "state", "variation.agent.color"):
+        np.testing.assert_array_equal(world.infos[key][1], before[key][1], key)
+        np.testing.assert_array_equal(world.infos[key][0], other[key][0], key)
+        assert not np.array_equal(before[key][1], other[key][1]), key
+
+
 def test_restored_snapshot_repeats_the_next_step():
     world = rooms(num_envs=1)
     world.set_policy(Zero(0.7))

@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -372,6 +372,18 @@ class StoredDataset(Dataset):
             self._keys.append(target)
 
 
+def _check_same_clips(name: str, datasets: Sequence[Any]) -> None:
+    """Checks that the clips of datasets have the same steps, as far as the datasets state them.
+
+    Raises:
+        ValueError: If not.
+    """
+    for key in ("num_steps", "frameskip"):
+        stated = {value for dataset in datasets if isinstance(value := getattr(dataset, key, None), (int, np.integer))}
+        if len(stated) > 1:
+            raise ValueError(f"{name}: the datasets must have the same num_steps and frameskip, got {key} {sorted(stated)}")
+
+
 class MergeDataset:
     """The columns of several datasets with the same episodes.
 
@@ -388,6 +400,7 @@ class MergeDataset:
         lengths = [np.asarray(dataset.lengths).tolist() for dataset in self.datasets]
         if any(other != lengths[0] for other in lengths):
             raise ValueError("MergeDataset: the datasets must have the same episodes, but their lengths differ")
+        _check_same_clips("MergeDataset", self.datasets)
         if any(len(dataset) != len(self.datasets[0]) for dataset in self.datasets):
             raise ValueError("MergeDataset: the datasets must have the same num_steps and frameskip")
         if keys_from_dataset is None:
@@ -483,6 +496,7 @@ class ConcatDataset:
         if not datasets:
             raise ValueError("ConcatDataset: expected at least one dataset")
         self.datasets = list(datasets)
+        _check_same_clips("ConcatDataset", self.datasets)
         self._clips_before = np.cumsum([0, *(len(dataset) for dataset in self.datasets)])
         self._episodes_before = np.cumsum([0, *(len(dataset.lengths) for dataset in self.datasets)])
         self._rows_before = np.cumsum([0, *(int(np.sum(dataset.lengths)) for dataset in self.datasets)])
@@ -602,11 +616,25 @@ def _items(dataset: Any, indices: Sequence[int]) -> list[dict[str, Any]]:
     return [dataset[i] for i in indices]
 
 
+class _GoalClips(NamedTuple):
+    """The clips of a :class:`GoalDataset`."""
+
+    #: The dataset, or the content of a replay buffer at a moment.
+    content: Any
+    #: The indices of the clips in the dataset, with their episodes and first rows.
+    indices: Array
+    clips: Array
+    #: The number of rows of every episode, and the rows before it.
+    lengths: Array
+    rows_before: Array
+
+
 class GoalDataset:
     """A dataset whose samples have a goal: a row of the dataset, `(1, ...)`.
 
     The goal is a random row of the dataset, a later step of the episode (nearer steps more likely, or all steps equally
-    likely), or the current step. Clips without a later step are left out if the goal can be a later step.
+    likely), or the current step. Clips without a later step are left out if the goal can be a later step. The clips of a
+    :class:`ReplayBuffer` are those of its content at each call.
 
     Args:
         dataset: The dataset.
@@ -648,17 +676,30 @@ class GoalDataset:
         self.seed = seed
         self.epoch = 0
         self._fresh: tuple[int, np.random.Generator] | None = None
-        self._rows_before = np.cumsum([0, *np.asarray(dataset.lengths).tolist()])
-        self._now = (self.current_goal_offset - 1) * dataset.frameskip
-        clips = np.asarray(dataset.clip_indices, dtype=np.int64).reshape(-1, 2)
-        _, geometric, uniform, _ = self.goal_probabilities
-        if geometric > 0 or uniform > 0:
-            later = clips[:, 1] + self._now + dataset.frameskip < np.asarray(dataset.lengths)[clips[:, 0]]
-        else:
-            later = np.ones(len(clips), dtype=bool)
-        #: The indices of the dataset's clips that have a goal.
-        self._indices = np.flatnonzero(later)
-        self._clips = clips[later]
+        #: The rows from the first to the current step of a clip.
+        self._ahead = (self.current_goal_offset - 1) * dataset.frameskip
+        self._found: _GoalClips | None = None
+        self._clips()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes without the clips, which are found again."""
+        return {**self.__dict__, "_found": None}
+
+    def _clips(self) -> _GoalClips:
+        """The clips that have a goal; of a replay buffer, those of its content at this moment."""
+        content = self.dataset._now if hasattr(type(self.dataset), "_now") else self.dataset
+        found = self._found
+        if found is None or found.content is not content:
+            lengths = np.asarray(content.lengths)
+            clips = np.asarray(content.clip_indices, dtype=np.int64).reshape(-1, 2)
+            _, geometric, uniform, _ = self.goal_probabilities
+            if geometric > 0 or uniform > 0:
+                later = clips[:, 1] + self._ahead + self.dataset.frameskip < lengths[clips[:, 0]]
+            else:
+                later = np.ones(len(clips), dtype=bool)
+            rows_before = np.cumsum([0, *lengths.tolist()])
+            self._found = found = _GoalClips(content, np.flatnonzero(later), clips[later], lengths, rows_before)
+        return found
 
     def set_epoch(self, epoch: int) -> None:
         """Sets the epoch, which determines the goals together with the seed.
@@ -670,7 +711,7 @@ class GoalDataset:
     @property
     def clip_indices(self) -> list[tuple[int, int]]:
         """The episode and the first row of every clip."""
-        return [(int(episode), int(start)) for episode, start in self._clips]
+        return [(int(episode), int(start)) for episode, start in self._clips().clips]
 
     @property
     def column_names(self) -> list[str]:
@@ -692,7 +733,7 @@ class GoalDataset:
         return dict(self.dataset.get_episode_data(episodes_idx))
 
     def __len__(self) -> int:
-        return len(self._indices)
+        return len(self._clips().indices)
 
     def _random(self, idx: int) -> np.random.Generator:
         if self.seed is not None:
@@ -702,17 +743,17 @@ class GoalDataset:
             self._fresh = (os.getpid(), np.random.default_rng())
         return self._fresh[1]
 
-    def _draw(self, idx: int) -> tuple[int, int]:
+    def _draw(self, found: _GoalClips, idx: int) -> tuple[int, int]:
         """Samples the episode and the row of a goal."""
         random = self._random(idx)
-        episode, start = (int(index) for index in self._clips[idx])
-        now, skip = start + self._now, self.dataset.frameskip
-        later = (int(self.dataset.lengths[episode]) - 1 - now) // skip
+        episode, start = (int(index) for index in found.clips[idx])
+        now, skip = start + self._ahead, self.dataset.frameskip
+        later = (int(found.lengths[episode]) - 1 - now) // skip
         kind = random.choice(4, p=self.goal_probabilities)
         if kind == 0:
-            row = int(random.integers(self._rows_before[-1]))
-            episode = int(np.searchsorted(self._rows_before, row, side="right")) - 1
-            return episode, row - int(self._rows_before[episode])
+            row = int(random.integers(found.rows_before[-1]))
+            episode = int(np.searchsorted(found.rows_before, row, side="right")) - 1
+            return episode, row - int(found.rows_before[episode])
         if kind == 1:
             return episode, now + min(int(random.geometric(max(1 - self.gamma, 1e-6))), later) * skip
         if kind == 2:
@@ -725,18 +766,20 @@ class GoalDataset:
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
         """The samples of a batch."""
         indices = _tensors.whole("indices", indices).tolist()
-        wrong = [i for i in indices if not -len(self) <= i < len(self)]
+        found = self._clips()
+        content, count = found.content, len(found.indices)
+        wrong = [i for i in indices if not -count <= i < count]
         if wrong:
-            raise IndexError(f"clip {wrong[0]} is outside the dataset, which has {len(self)} clips")
-        indices = [i % len(self) for i in indices]
-        samples = [dict(sample) for sample in _items(self.dataset, self._indices[indices].tolist())]
+            raise IndexError(f"clip {wrong[0]} is outside the dataset, which has {count} clips")
+        indices = [i % count for i in indices]
+        samples = [dict(sample) for sample in _items(content, found.indices[indices].tolist())]
         if not self.goal_keys:
             return samples
-        goal_rows = np.asarray([self._draw(i) for i in indices])
-        if isinstance(self.dataset, StoredDataset):
-            goals = self.dataset._slices(goal_rows[:, 0], goal_rows[:, 1], goal_rows[:, 1] + 1)
+        goal_rows = np.asarray([self._draw(found, i) for i in indices])
+        if isinstance(content, StoredDataset):
+            goals = content._slices(goal_rows[:, 0], goal_rows[:, 1], goal_rows[:, 1] + 1)
         else:
-            goals = [self.dataset._load_slice(episode, row, row + 1) for episode, row in goal_rows.tolist()]
+            goals = [content._load_slice(episode, row, row + 1) for episode, row in goal_rows.tolist()]
         for sample, goal in zip(samples, goals, strict=True):
             for name, goal_name in self.goal_keys.items():
                 if name in goal and name in sample:

@@ -32,18 +32,34 @@ def _like(value: Any, *bounds: Array | None) -> list[Any]:
 
 
 def _real(value: Any) -> Any:
-    """The values, with integers and booleans of a tensor in double precision, as numpy computes them."""
-    return value if not _is_tensor(value) or value.is_floating_point() else value.double()
+    """The values, with integers and booleans of a tensor in double precision, as numpy does, and half in single precision."""
+    if not _is_tensor(value):
+        return value
+    if not value.is_floating_point():
+        return value.double()
+    return value.float() if value.element_size() < 4 else value
+
+
+def _as_given(scaled: Any, given: Any) -> Any:
+    """Scaled values in the half precision of the given ones."""
+    half = _is_tensor(given) and given.is_floating_point() and given.element_size() < 4
+    return scaled.to(given.dtype) if half else scaled
 
 
 def _finite_rows(values: Any) -> Array:
-    """The rows `(n, d)` without NaN. The missing action of an episode's last row is NaN."""
+    """The rows `(n, d)` without NaN. The missing action of an episode's last row is NaN.
+
+    Raises:
+        ValueError: If there is no such row, or a number is infinite.
+    """
     array = _tensors.to_numpy(values)
     array = array.astype(np.float64) if array.dtype == bool else array
     array = array.reshape(-1, array.shape[-1] if array.ndim > 1 else 1)
     array = array[~np.isnan(array).any(axis=1)]
     if len(array) == 0:
         raise ValueError("fit: expected at least one row without NaN")
+    if infinite := int(np.isinf(array).any(axis=1).sum()):
+        raise ValueError(f"fit: {infinite} of {len(array)} rows have an infinite number; leave them out")
     return array
 
 
@@ -83,15 +99,15 @@ class _Affine:
 
     def transform(self, X: Any) -> Any:
         """The scaled values, `(..., d)`."""
-        X = _real(X)
-        centre, scale = _like(X, *self._bounds())
-        return (X - centre) / scale
+        real = _real(X)
+        centre, scale = _like(real, *self._bounds())
+        return _as_given((real - centre) / scale, X)
 
     def inverse_transform(self, X: Any) -> Any:
         """The original values of scaled values, `(..., d)`."""
-        X = _real(X)
-        centre, scale = _like(X, *self._bounds())
-        return X * scale + centre
+        real = _real(X)
+        centre, scale = _like(real, *self._bounds())
+        return _as_given(real * scale + centre, X)
 
     def fit_transform(self, X: Any) -> Any:
         """Fits the scaler to the values and scales them."""
@@ -113,7 +129,10 @@ class ZScoreScaler(_Affine):
     def fit(self, X: Any) -> ZScoreScaler:
         """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
         rows = _finite_rows(X)
-        self.mean, self.std = rows.mean(axis=0, keepdims=True), rows.std(axis=0, keepdims=True)
+        # Sums of many numbers need double precision; results have the precision of the column, at least single.
+        kind = np.result_type(rows.dtype, np.float32) if rows.dtype.kind == "f" else np.float64
+        self.mean = rows.mean(axis=0, keepdims=True, dtype=np.float64).astype(kind)
+        self.std = rows.std(axis=0, keepdims=True, dtype=np.float64).astype(kind)
         return self
 
     def _bounds(self) -> tuple[Array | None, Array | None]:

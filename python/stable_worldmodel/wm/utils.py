@@ -6,11 +6,12 @@ save_pretrained(model, "mine", config=config)
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,15 @@ from .checkpoints import is_stored, module_of
 
 __all__ = ["load_pretrained", "save_pretrained"]
 
+#: The entry of a file of weights that says that `save_pretrained` wrote it.
+_MARK = "stable_worldmodel.json"
+
 #: Modules without weights, beside those with a tensor in the file.
 _FREE_MODULES = 4096
+
+#: The largest integer of a configuration, unless the file of the weights has more bytes: lists and masks can have as many
+#: elements before there is a tensor to count.
+_LARGEST = 1 << 20
 
 #: The largest size of a configuration, in bytes.
 _MOST_SETTINGS = 16 << 20
@@ -65,47 +73,59 @@ def save_pretrained(
         raise ValueError(f"filename: expected a plain name for the weights, such as 'weights.pt', got {filename!r}")
     if (folder / "weights.safetensors").exists():
         raise FileExistsError(f"{folder}: it holds a checkpoint of the engine; choose another run_name")
-    is_other = config is not None and os.path.lexists(settings) and not (_is_settings(settings) and any(_saved(folder)))
-    for file in [stored] * (os.path.lexists(stored) and not _is_saved(stored)) + [settings] * is_other:
+    old = [_hash(settings.read_bytes())] if _is_own_settings(settings) else []
+    is_other = config is not None and os.path.lexists(settings) and not old
+    for file in [stored] * (os.path.lexists(stored) and _marks(stored) is None) + [settings] * is_other:
         raise FileExistsError(f"{file}: save_pretrained did not write this file; choose another run_name")
     folder.mkdir(parents=True, exist_ok=True)
-    weights = model.state_dict()
-    files: dict[Path, Callable[[Path], object]] = {stored: lambda beside: torch.save(weights, beside)}
+    weights, hashes = model.state_dict(), old
+    files: dict[Path, Callable[[Path], object]] = {stored: lambda beside: _save(weights, beside, hashes)}
     if config is None:
         warnings.warn(f"{folder}: saved without a config, so load_pretrained cannot build the model", stacklevel=2)
     else:
-        text = _text(_plain(config[config_key] if config_key is not None and config_key in config else config))
+        text = json.dumps(_plain(config[config_key] if config_key is not None and config_key in config else config), indent=2)
         if len(text) > _MOST_SETTINGS:
             raise ValueError(f"config: it has {len(text)} characters, more than the {_MOST_SETTINGS} that are read again")
-        files[settings] = lambda beside: beside.write_text(text)
+        encoded = text.encode()
+        # The old one as well, because a kill may come before it is replaced.
+        hashes = [*old, _hash(encoded)]
+        files[settings] = lambda beside: beside.write_bytes(encoded)
     _files.replace(files)
 
 
-def _is_saved(file: Path) -> bool:
-    """Whether a file is one of `torch.save`: an archive with a pickle."""
+def _save(weights: Mapping[str, Any], file: Path, hashes: list[str]) -> None:
+    """Writes weights with a mark: the hashes of the configurations that are written with them."""
+    torch.save(weights, file)
+    with zipfile.ZipFile(file, "a") as archive:
+        root = archive.namelist()[0].partition("/")[0]
+        archive.writestr(zipfile.ZipInfo(f"{root}/{_MARK}"), json.dumps(hashes))
+
+
+def _marks(file: Path) -> list[str] | None:
+    """The hashes in the mark of weights; `None` if `save_pretrained` did not write the file."""
     if not file.is_file() or not zipfile.is_zipfile(file):
-        return False
+        return None
     with zipfile.ZipFile(file) as archive:
-        names = {name.rpartition("/")[2] for name in archive.namelist()}
-    # An archive of TorchScript has constants as well.
-    return "data.pkl" in names and "constants.pkl" not in names
+        found = [name for name in archive.namelist() if name.partition("/")[2] == _MARK]
+        if not found or archive.getinfo(found[0]).file_size > 1 << 16:
+            return None
+        try:
+            hashes = json.loads(archive.read(found[0]))
+        except (OSError, ValueError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
+            return None
+    return hashes if isinstance(hashes, list) else None
 
 
-def _saved(folder: Path) -> Iterator[Path]:
-    return (file for file in folder.iterdir() if _is_saved(file))
-
-
-def _is_settings(file: Path) -> bool:
-    """Whether a file holds the configuration of a model, as `save_pretrained` writes it."""
-    try:
-        return file.read_text() == _text(_read_settings(file))
-    except (OSError, ValueError):
+def _is_own_settings(file: Path) -> bool:
+    """Whether `save_pretrained` wrote a configuration and nobody has changed it: weights beside it have its hash."""
+    if not file.is_file() or file.stat().st_size > _MOST_SETTINGS:
         return False
+    hash = _hash(file.read_bytes())
+    return any(hash in (_marks(other) or ()) for other in file.parent.iterdir())
 
 
-def _text(config: Any) -> str:
-    """The text of a configuration, as `save_pretrained` writes it."""
-    return json.dumps(config, indent=2)
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _plain(config: Any) -> Any:
@@ -181,6 +201,11 @@ def _built(config: Any, stored_bytes: int, stored_tensors: int) -> Any:
             f"the configuration describes {_modules(config)} modules, and the weights have {stored_tensors} tensors; "
             "pass trust=True if you trust the files"
         )
+    if (largest := _largest(config)) > max(_LARGEST, stored_bytes):
+        raise ValueError(
+            f"the configuration has the number {largest}, and the file of the weights {stored_bytes} bytes; "
+            "pass trust=True if you trust the files"
+        )
     # Without memory first: a large model is refused before it takes any.
     with bounded(stored_bytes, stored_tensors), torch.device("meta"):
         build(config)
@@ -196,6 +221,13 @@ def _modules(config: Any) -> int:
     if isinstance(config, Mapping):
         return ("_target_" in config) + sum(_modules(value) for value in config.values())
     return sum(_modules(value) for value in config) if isinstance(config, list) else 0
+
+
+def _largest(config: Any) -> int:
+    """The largest integer in a configuration."""
+    if isinstance(config, (Mapping, list)):
+        return max((_largest(value) for value in (config.values() if isinstance(config, Mapping) else config)), default=0)
+    return config if isinstance(config, int) else 0
 
 
 def _located(name: str, folder: Path) -> Path:

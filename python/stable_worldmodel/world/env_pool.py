@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from .. import _engine
 from .. import spaces as swm_spaces
 from ..data import _tensors
 
@@ -267,5 +266,4 @@ class WorldEnvs(EnvPool):
     @property
     def seeds(self) -> np.ndarray:  # type: ignore[override]
         """The seeds of the last resets, `(num_envs,)`."""
-        seed, episodes = self._world.seed or 0, self._world._episodes
-        return np.array([_engine.World.episode_seed(seed, episode) for episode in episodes], dtype=np.int64)
+        return np.array([self._world._seed_of(episode) for episode in self._world._episodes], dtype=np.int64)

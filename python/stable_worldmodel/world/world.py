@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import secrets
@@ -145,6 +146,10 @@ class World:
         self._actors: dict[int, tuple[Any, Any]] = {}
         self._episodes = [0] * self.num_envs
         self._next_episode = 0
+        #: Whether `collect` or `evaluate` is calling a policy implemented in Python.
+        self._calling = False
+        #: The seeds of the first episodes, if `reset` got a list.
+        self._first_seeds: Sequence[int] = ()
         #: The options of resets, the same for all environments or one for each.
         self._reset_text: str | list[str] = _options.reset(None, {})
         self._fresh = np.ones(self.num_envs, bool)
@@ -255,7 +260,7 @@ class World:
 
         Args:
             seed: The seed of the episodes: environment `i` plays episode `i` of this seed, as in `collect` and `evaluate`.
-                A list holds one environment seed for each environment. Random for `None`.
+                A list holds the environment seeds of the first episodes; those of later ones follow from it. Random for `None`.
             options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
                 A list holds the options of each environment.
         """
@@ -269,19 +274,23 @@ class World:
         named = self._varied_by(options if isinstance(options, Sequence) else [options])
         self._varied = self._varied if named is None else named
         single = seed is None or isinstance(seed, (int, np.integer))
-        self.seed = _seed(seed if single else None)  # type: ignore[arg-type]
+        first = [] if single else [_seed(given) for given in seed]  # type: ignore[union-attr]
+        if not single and len(first) != self.num_envs:
+            raise ValueError(f"seed: expected {self.num_envs} seeds, one for each environment, got {len(first)}")
+        self.seed = _seed(seed) if single else _joined(first)  # type: ignore[arg-type]
+        self._first_seeds = first
         self._episodes = list(range(self.num_envs))
         self._next_episode = self.num_envs
-        if not single:
-            seeds = [_seed(given) for given in seed]  # type: ignore[union-attr]
-            if len(seeds) != self.num_envs:
-                raise ValueError(f"seed: expected {self.num_envs} seeds, one for each environment, got {len(seeds)}")
-        else:
-            seeds = [_engine.World.episode_seed(self.seed, i) for i in range(self.num_envs)]
-        self._reset_slots(list(enumerate(seeds)))
+        self._reset_slots([(slot, self._seed_of(slot)) for slot in range(self.num_envs)])
         self._begin(range(self.num_envs))
         self._actions[:] = np.nan if self._actions.dtype.kind == "f" else -1
         self._transform()
+
+    def _seed_of(self, episode: int) -> int:
+        """The environment's seed of an episode since the last `reset`."""
+        if episode < len(self._first_seeds):
+            return self._first_seeds[episode]
+        return _engine.World.episode_seed(self.seed or 0, episode)
 
     def _reset_slots(self, starts: list[tuple[int, int]]) -> None:
         """Resets environments, given as pairs of slot and seed, with the options of the last `reset`."""
@@ -354,8 +363,7 @@ class World:
                 for slot in slots:
                     self._episodes[slot] = self._next_episode
                     self._next_episode += 1
-                starts = [(slot, _engine.World.episode_seed(self.seed or 0, self._episodes[slot])) for slot in slots]
-                self._reset_slots(starts)
+                self._reset_slots([(slot, self._seed_of(self._episodes[slot])) for slot in slots])
                 self._begin(slots)
             self._transform()
 
@@ -376,8 +384,10 @@ class World:
         return self._world.snapshot(self._checked_index(index))
 
     def restore(self, state: bytes, index: int = 0) -> None:
-        """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
+        """Restores a snapshot and refreshes `infos`. Later steps repeat the steps after the snapshot bit for bit."""
         self._world.restore(self._checked_index(index), state)
+        self._show_factors([index])
+        self._transform()
 
     def _checked_index(self, index: int) -> int:
         """The index of an environment.
@@ -391,13 +401,18 @@ class World:
 
     def _begin(self, slots: Sequence[int]) -> None:
         self._fresh[list(slots)] = True
-        for policy, actor in self._actors.values():
-            if policy is self.policy:
-                for slot in slots:
-                    self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
+        # Those that act within a policy implemented in Python as well.
+        for _, actor in self._actors.values():
+            for slot in slots:
+                self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
 
     def _engine_actions(self, policy: Any) -> np.ndarray:
         """The actions `(num_envs, ..)` of a policy of the engine for the current infos."""
+        if self._calling:
+            raise RuntimeError(
+                f"{type(policy).__name__}: a policy of the engine within one implemented in Python acts in World.step only; "
+                "in collect and evaluate, mix policies of the engine with MixturePolicy"
+            )
         active = ~(self.terminateds | self.truncateds)
         self._world.act(self._actor(policy), active.tolist())
         shape = self.envs.action_space.shape
@@ -405,6 +420,11 @@ class World:
 
     def _checked_actions(self, policy: Any, infos: dict[str, Any], active: np.ndarray) -> np.ndarray:
         """The actions of a policy implemented in Python, checked and in the shape and type of the engine."""
+        if getattr(policy, "_of_one_world", False) and policy.env is not self.envs:
+            raise RuntimeError(
+                f"{type(policy).__name__}: another world took the policy with its set_policy; "
+                "call set_policy again, or make a policy for each world"
+            )
         get_action = getattr(policy, "get_action", None) or policy.get_actions
         given = get_action(infos)
         name = type(policy).__name__
@@ -461,7 +481,11 @@ class World:
                 infos.pop("goal", None)
             for key in self._frames.keys() & infos.keys():
                 infos[key] = self.transforms(key, infos[key])
-            return self._checked_actions(policy, infos, active)
+            self._calling = True
+            try:
+                return self._checked_actions(policy, infos, active)
+            finally:
+                self._calling = False
 
         return _engine.Actor.python(self._world, call)
 
@@ -712,6 +736,12 @@ def _seed(seed: int | None) -> int:
     if int(seed) != seed or not 0 <= seed < 2**63:
         raise ValueError(f"seed: {seed}; expected an integer from 0 to 2^63 - 1")
     return int(seed)
+
+
+def _joined(seeds: Sequence[int]) -> int:
+    """One seed for what the seeds of the environments do not state: policies, and the episodes after the first ones."""
+    digest = hashlib.sha256(repr(list(seeds)).encode()).digest()
+    return int.from_bytes(digest[:4], "little")
 
 
 def _name(policy: Any) -> str:

@@ -58,9 +58,10 @@ class TDMPC2(Pretrained):
         self.scale = RunningScale(float(setting(wm, "tau", 0.01)))
         if self.use_pixels:
             self.cnn = _convolutions()
-            with torch.no_grad():
-                side = int(setting(cfg, "image_size"))
-                features = self.cnn(torch.zeros(1, 3, side, side)).shape[1]
+            side = int(setting(cfg, "image_size"))
+            # Without memory for the frame.
+            with torch.no_grad(), torch.device("meta"):
+                features = _convolutions()(torch.zeros(1, 3, side, side)).shape[1]
             self.pixel_encoder = nn.Linear(features, self.encoding["pixels"])
         self.extra_encoders = self._encoders(wm) if extra_encoders is None else extra_encoders
         self.sim_norm = SimNorm(cfg)

@@ -200,6 +200,7 @@ def test_threads_save_metrics_to_one_file(tmp_path):
     [
         (np.zeros((2, 3)), r"actions: got actions of shape \(2, 3\), expected \(3, 2\)"),
         (np.full((3, 2), 0.5 + 9j), "actions: expected real actions"),
+        (np.full((3, 2), "0.5", object), "actions: expected real actions"),
         (np.full((3, 2), np.nan), "actions: expected finite actions"),
     ],
 )
@@ -208,6 +209,14 @@ def test_steps_refuse_other_actions(actions, words):
     world.reset(seed=0)
     with pytest.raises(ValueError, match=words):
         world.envs.step(actions)
+
+
+def test_discrete_actions_are_whole_numbers():
+    world = swm.World("swm/CartPoleControl-v1", num_envs=2)
+    world.reset(seed=0)
+    world.envs.step(np.array([1.0, 0.0]))
+    with pytest.raises(ValueError, match="actions: expected whole numbers"):
+        world.envs.step(np.array([1.0, 0.7]))
 
 
 def test_metrics_name_the_episodes_that_count():

@@ -384,7 +384,8 @@ class World:
         return self._world.snapshot(self._checked_index(index))
 
     def restore(self, state: bytes, index: int = 0) -> None:
-        """Restores a snapshot and refreshes `infos`. Later steps repeat the steps after the snapshot bit for bit."""
+        """Restores a snapshot and refreshes `infos`. The same actions repeat the steps after the snapshot bit for bit; the
+        policy, of which a snapshot has nothing, goes on as it was."""
         self._world.restore(self._checked_index(index), state)
         self._show_factors([index])
         self._transform()
@@ -444,12 +445,15 @@ class World:
             expected = self.envs.action_space.shape
             raise ValueError(f"{what}: got actions of shape {given.shape}, expected {expected}")
         given = given.reshape(want.shape)
-        if given.dtype.kind in "cSUmMV":
+        has_texts = given.dtype == object and any(isinstance(value, (str, bytes)) for value in given.flat)
+        if given.dtype.kind in "cSUmMV" or has_texts:
             kind = "complex numbers" if given.dtype.kind == "c" else str(given.dtype)
             raise ValueError(f"{what}: expected real actions, got {kind}")
         if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
             raise ValueError(f"{what}: expected finite actions, got {given[active]}")
         if want.dtype.kind != "f":
+            if given.dtype.kind == "f" and (given[active] % 1).any():
+                raise ValueError(f"{what}: expected whole numbers, got {given[active]}")
             given = np.nan_to_num(given, nan=0)
         return np.ascontiguousarray(given, dtype=want.dtype)
 

@@ -117,6 +117,9 @@ def test_numbers_that_no_file_of_weights_needs_are_refused(home):
     save_pretrained(torch.nn.Linear(2, 2), "frames", {**attention, "num_frames": 2_000_000_000})
     with pytest.raises(ValueError, match="the number 2000000000"):
         load_pretrained("frames")
+    save_pretrained(torch.nn.Linear(2, 2), "tokens", {**attention, "num_frames": 100_000, "num_patches": 100_000})
+    with pytest.raises(RuntimeError, match="do not fit Attention"):
+        load_pretrained("tokens")
     small = {"mlp_dim": 1, "num_bins": 2, "enc_dim": 1, "num_q": 1, "vmin": -1, "vmax": 1, "simnorm_dim": 8}
     sizes = {"action_dim": 1, "image_size": 30_000, "wm": {"encoding": {"pixels": 0, "x": 8}, **small}, "extra_dims": {"x": 1}}
     save_pretrained(torch.nn.Linear(2, 2), "side", {"_target_": "stable_worldmodel.wm.tdmpc2.tdmpc2.TDMPC2", "cfg": sizes})

@@ -75,11 +75,11 @@ class Attention(nn.Module):
         self.to_kv = nn.Linear(dim, 2 * inner, bias=False)
         one_full_head = heads == 1 and dim_head == dim
         self.to_out = nn.Identity() if one_full_head else nn.Sequential(nn.Linear(inner, dim), nn.Dropout(dropout))
-        frames = torch.arange(num_frames)
-        tokens = frames.repeat_interleave(num_patches)
         if att_type == "frame_agg":
             self.frame_tokens = nn.Parameter(0.02 * torch.randn(1, num_frames, dim))
         if self.causal:
+            frames = torch.arange(num_frames)
+            tokens = frames.repeat_interleave(num_patches)
             self.register_buffer("causal_mask", _frame_mask(frames if att_type == "frame_agg" else tokens, tokens))
 
     def forward(self, x: Tensor, c: Tensor | None = None) -> Tensor:

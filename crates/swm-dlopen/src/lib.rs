@@ -4,9 +4,11 @@
 //! library is loaded. A program therefore starts without the library, and as fast as if it did not use it. [`Once`] loads
 //! once, and again after a failure.
 
+mod fork;
+
 use std::error::Error;
 use std::ffi::CStr;
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::OnceLock;
 
 /// Defines functions as trampolines: `functions! { TABLE: NAME … }`.
 ///
@@ -113,31 +115,29 @@ pub fn reason(error: &dyn Error) -> String {
     last.to_string()
 }
 
-/// Something that is done once. After a failure, the next call tries again.
+/// Something that is done once, such as the loading of a library. After a failure, the next call tries again.
 #[derive(Debug, Default)]
-pub struct Once {
-    done: OnceLock<()>,
-    doing: Mutex<()>,
-}
+pub struct Once(OnceLock<()>);
 
 impl Once {
     /// Returns a value that has done nothing.
     pub const fn new() -> Self {
-        Self { done: OnceLock::new(), doing: Mutex::new(()) }
+        Self(OnceLock::new())
     }
 
-    /// Calls `act`, unless it was called before with success. Concurrent callers wait.
+    /// Calls `act`, unless it was called before with success. Concurrent callers wait, those of other values too, and so do forks of
+    /// the process.
     ///
     /// # Errors
     /// Those of `act`.
     pub fn run<E>(&self, act: impl FnOnce() -> Result<(), E>) -> Result<(), E> {
-        if self.done.get().is_some() {
+        if self.0.get().is_some() {
             return Ok(());
         }
-        let _lock = self.doing.lock().unwrap_or_else(PoisonError::into_inner);
-        if self.done.get().is_none() {
+        let _lock = fork::lock();
+        if self.0.get().is_none() {
             act()?;
-            self.done.get_or_init(|| ());
+            self.0.get_or_init(|| ());
         }
         Ok(())
     }

@@ -201,6 +201,11 @@ impl VideoRecording {
                 Ok(()) => written.push(name),
                 Err(error) => {
                     tracing::warn!("{error}");
+                    if self.videos.staged {
+                        // Those that hold other videos stay, as do those that cannot be deleted.
+                        let _ = files::remove_empty_folder(folder)
+                            .and_then(|()| files::remove_empty_folder(&self.videos.root.join(STAGED)));
+                    }
                     break;
                 }
             }

@@ -1,6 +1,7 @@
 //! MP4 videos with FFmpeg's libraries, in process: decodes frames by index and encodes frames.
 //!
 //! - [`Video`], [`DecoderPool`]: read frames by index with pooled decoders.
+//! - [`load`]: loads FFmpeg; callers do it before they create files, others have it done for the first video.
 //! - [`VideoCache`]: caches the opened videos of a dataset.
 //! - [`encode`], [`Encoder`]: write videos for training (a key frame every few frames) or for viewing.
 //!
@@ -23,6 +24,7 @@ mod video;
 pub use cache::VideoCache;
 pub use decode::{DecoderPool, FrameRequest};
 pub use encode::{Encoder, Encoding, Quality, encode};
+pub use link::load;
 pub use video::{Source, Video};
 
 use std::path::Path;

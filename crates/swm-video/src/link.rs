@@ -49,22 +49,34 @@ pub fn load() -> Result<()> {
 fn open() -> Result<()> {
     // The portable wheel is linked with its own FFmpeg, whose files have other names.
     if linked(c"avformat_version").is_some() && linked(c"swscale_version").is_some() {
-        // SAFETY: the libraries have the versions whose functions `ffmpeg-next` declares, and `load` excludes other calls. A function
-        // that a version lacks is not among the declared ones and is not called.
-        return unsafe { fill(|name| Ok(linked(name))) };
+        // SAFETY: the libraries have the versions whose functions `ffmpeg-next` declares, and `load` excludes other calls.
+        return unsafe { fill(|name| expected(name, linked(name))) };
     }
     let libraries = [open_library(LIBRARIES[0])?, open_library(LIBRARIES[1])?];
     let find = |name: &CStr| {
         // SAFETY: only the address is taken.
         let address =
             |library: &Library| unsafe { library.get::<*const ()>(name.to_bytes_with_nul()) }.ok().map(|at| *at);
-        Ok(libraries.iter().find_map(address))
+        expected(name, libraries.iter().find_map(address))
     };
     // SAFETY: as above.
     unsafe { fill(find)? };
     // Unloading would invalidate the addresses in the table.
     std::mem::forget(libraries);
     Ok(())
+}
+
+/// Functions that later versions lack. Programs that are built for these do not call them.
+const REMOVED: [&CStr; 2] = [c"av_init_packet", c"avcodec_close"];
+
+/// Checks that a function has an address, unless it is one of [`REMOVED`].
+fn expected(name: &CStr, address: Option<*const ()>) -> Result<Option<*const ()>> {
+    if address.is_none() && !REMOVED.contains(&name) {
+        let problem =
+            format!("they lack the function {}; install FFmpeg's libraries of this version", name.to_string_lossy());
+        return Err(Error::external("loading FFmpeg's libraries for a video", problem));
+    }
+    Ok(address)
 }
 
 /// Returns the address of a function in libraries that this module of the process is linked with, of the right versions.
@@ -96,6 +108,13 @@ mod tests {
         for part in ["libswm-missing.so.1 for a video", "No such file", "install FFmpeg's libraries"] {
             assert!(error.contains(part), "{error}");
         }
+    }
+
+    #[test]
+    fn library_without_a_function_is_an_error_that_names_it() {
+        let error = expected(c"sws_scale", None).err().map(|error| error.to_string()).unwrap_or_default();
+        assert!(error.contains("sws_scale"), "{error}");
+        assert!(expected(c"avcodec_close", None).is_ok());
     }
 
     /// Frames are decoded and encoded in the other tests of this crate; this one finds what the list lacks.

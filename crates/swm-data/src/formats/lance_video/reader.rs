@@ -13,6 +13,7 @@ use swm_video::{Source, VideoCache};
 /// Opens a dataset.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     let steps = lance::ENTRY.open(&table(location)?)?;
+    swm_video::load()?;
     let schema = match steps.episodes() {
         [] => steps.schema().clone(),
         _ => {

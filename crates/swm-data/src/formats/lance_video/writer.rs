@@ -21,6 +21,7 @@ const MAX_DATA_FILE_BYTES: usize = 4 << 20;
 pub(super) fn create(location: &Location, schema: &Schema, mut options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
     ENTRY.check_suffix(location)?;
+    swm_video::load()?;
     let table_location = table(location)?;
     let columns: Vec<ColumnSpec> = schema.columns().iter().filter(|column| !column.is_image()).cloned().collect();
     if columns.iter().all(|column| column.name == EPISODE_IDX || column.name == STEP_IDX) {

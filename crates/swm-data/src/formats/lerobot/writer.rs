@@ -72,6 +72,9 @@ impl LerobotWriter {
     fn create(root: &Path, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
         options.codec.check()?;
         let columns = stored_columns(schema)?;
+        if schema.columns().iter().any(ColumnSpec::is_image) {
+            swm_video::load()?;
+        }
         set_aside::recover_unlocked(root, removal::Files)?;
         let exists = root.join(INFO).is_file();
         let is_occupied = root.read_dir().is_ok_and(|mut entries| entries.next().is_some());

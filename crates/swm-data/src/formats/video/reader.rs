@@ -13,7 +13,9 @@ use swm_video::{Source, VideoCache};
 
 /// Opens a dataset of the format `video`.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
-    Ok(Arc::new(VideoReader::open(location.local("video")?)?))
+    let reader = VideoReader::open(location.local("video")?)?;
+    swm_video::load()?;
+    Ok(Arc::new(reader))
 }
 
 pub(super) struct VideoReader {

@@ -17,6 +17,7 @@ const FPS: u32 = 25;
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("video")?;
     options.codec.check()?;
+    swm_video::load()?;
     let continues = options.continues.clone();
     let known = || {
         let known = VideoReader::open(folder)?;

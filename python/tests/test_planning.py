@@ -577,12 +577,12 @@ def test_policy_planned_in_python_belongs_to_the_world_that_took_it_last():
             return {"actions": torch.zeros(self.envs, 4, 2)}
 
     policy = swm.policy.MPCPolicy(Still(), swm.policy.PlanConfig(horizon=4, receding_horizon=4))
-    worlds = [swm.World("swm/TwoRoom-v1", num_envs=1, add_pixels=False) for _ in range(2)]
-    for world in worlds:
+    first, second = (swm.World("swm/TwoRoom-v1", num_envs=1, add_pixels=False) for _ in range(2))
+    for world in (first, second):
         world.set_policy(policy)
         world.reset(seed=0)
-    worlds[1].step()
+    second.step()
     with pytest.raises(RuntimeError, match="MPCPolicy: another world took the policy"):
-        worlds[0].step()
-    worlds[0].set_policy(policy)
-    worlds[0].step()
+        first.step()
+    first.set_policy(policy)
+    first.step()

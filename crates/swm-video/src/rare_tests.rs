@@ -53,6 +53,40 @@ fn parameters_of_one_stream_do_not_count_for_another() {
     ["joined", "first", "joined", "first"].into_iter().for_each(|name| check(&decoders, name));
 }
 
+/// Writes the sizes of the samples as integers of 16 bits, in place of 32.
+fn with_compact_sizes(mut bytes: Vec<u8>) -> Vec<u8> {
+    let at = bytes.windows(4).position(|kind| kind == b"stsz").expect("the table of sizes");
+    bytes[at..at + 4].copy_from_slice(b"stz2");
+    assert_eq!(bytes[at + 8..at + 12], [0; 4], "each sample has a size");
+    bytes[at + 11] = 16;
+    let count = bytes[at + 15] as usize;
+    for i in 0..count {
+        let from = at + 16 + 4 * i;
+        assert_eq!(bytes[from..from + 2], [0; 2], "a size of 16 bits");
+        bytes.copy_within(from + 2..from + 4, at + 16 + 2 * i);
+    }
+    bytes
+}
+
+#[test]
+fn compact_tables_of_sizes_are_read() {
+    let (plain, compact) = (bytes("open"), with_compact_sizes(bytes("open")));
+    assert_ne!(plain, compact);
+    let frames: Vec<usize> = (0..opened(plain.clone()).expect("opening").frames()).collect();
+    let [plain, compact_frames] = [plain, compact.clone()].map(|file| {
+        let video = opened(file).expect("opening");
+        decode(&DecoderPool::default(), &video, &frames).expect("the frames")
+    });
+    assert!(plain == compact_frames);
+    let at = compact.windows(4).position(|kind| kind == b"stz2").expect("the table");
+    for (place, value, words) in [(11, 12, "sizes of 12 bits"), (13, 255, "cut short")] {
+        let mut damaged = compact.clone();
+        damaged[at + place] = value;
+        let error = opened(damaged).err().map(|error| error.to_string()).unwrap_or_default();
+        assert!(error.contains(words), "{error}");
+    }
+}
+
 /// Replaces the only place where `from` stands.
 fn changed(mut bytes: Vec<u8>, from: &[u8], to: &[u8]) -> Vec<u8> {
     let places: Vec<usize> = (0..=bytes.len() - from.len()).filter(|&i| bytes[i..].starts_with(from)).collect();

@@ -1,6 +1,6 @@
 //! The tables of a track: the codec of its samples, and where and when each sample is.
 
-use super::boxes::{Boxes, find, versioned};
+use super::boxes::{Boxes, Integers, find, versioned};
 use super::{Codec, Colours, Result, Sample};
 use std::sync::Arc;
 
@@ -89,11 +89,33 @@ fn table<'a>(stbl: &'a [u8], kind: &[u8; 4]) -> Result<&'a [u8]> {
     find(stbl, kind)?.ok_or(format!("lacks its table '{}'", kind.escape_ascii()))
 }
 
-/// Reads the sizes of the samples.
+/// The bits of a size in a table, and the number of sizes that follow.
+fn width_and_count(sizes: &mut Integers<'_>, is_compact: bool) -> Result<(u32, usize)> {
+    if !is_compact {
+        return Ok((32, sizes.count(4)?));
+    }
+    let (width, count) = (sizes.u32()? & 255, sizes.u32()? as usize);
+    if !matches!(width, 4 | 8 | 16) {
+        return Err(format!("has sizes of {width} bits, expected 4, 8 or 16"));
+    }
+    match (count as u64 * u64::from(width)).div_ceil(8) > sizes.0.len() as u64 {
+        true => Err("has a table that is cut short".to_owned()),
+        false => Ok((width, count)),
+    }
+}
+
+/// Reads the sizes of the samples, from their table or its compact form.
 fn sizes(stbl: &[u8], pixels: usize, length: u64) -> Result<Vec<Sample>> {
-    let (_, mut sizes) = versioned(table(stbl, b"stsz")?)?;
-    let common_size = sizes.u32()?;
-    let count = if common_size == 0 { sizes.count(4)? } else { sizes.u32()? as usize };
+    let compact = find(stbl, b"stz2")?;
+    let (_, mut sizes) = versioned(match compact {
+        Some(compact) => compact,
+        None => table(stbl, b"stsz")?,
+    })?;
+    let common_size = if compact.is_some() { 0 } else { sizes.u32()? };
+    let (width, count) = match common_size {
+        0 => width_and_count(&mut sizes, compact.is_some())?,
+        _ => (0, sizes.u32()? as usize),
+    };
     if count > MOST_SAMPLES {
         return Err(format!("states {count} frames, more than {MOST_SAMPLES}; cut it into shorter videos"));
     }
@@ -101,10 +123,15 @@ fn sizes(stbl: &[u8], pixels: usize, length: u64) -> Result<Vec<Sample>> {
         return Err("is shorter than its frames".to_owned());
     }
     let mut samples = vec![Sample { offset: 0, size: common_size, time: 0, key: false }; count];
-    for sample in &mut samples {
-        if common_size == 0 {
-            sample.size = sizes.u32()?;
-        }
+    let list = sizes.0;
+    for (i, sample) in samples.iter_mut().enumerate() {
+        sample.size = match width {
+            4 => u32::from(list[i / 2] >> (4 * (1 - i % 2)) & 15),
+            8 => u32::from(list[i]),
+            16 => u32::from(u16::from_be_bytes([list[2 * i], list[2 * i + 1]])),
+            32 => sizes.u32()?,
+            _ => common_size,
+        };
         if sample.size as usize > largest_sample(pixels) {
             let (size, most) = (sample.size, largest_sample(pixels));
             return Err(format!("states an encoded frame of {size} bytes, more than {most} for {pixels} pixels"));

@@ -243,6 +243,21 @@ def test_datasets_with_other_clips_are_not_joined(kind, tmp_path):
             kind([a, other])
 
 
+def test_goals_of_joined_datasets_are_rows_of_the_same_episode(tmp_path):
+    for name, first in (("a", 0), ("b", 100)):
+        with data.EpisodeWriter(tmp_path / f"{name}.h5", mode="overwrite") as writer:
+            for episode in range(2):
+                rows = first + 10 * episode + np.arange(6)
+                writer.write_episode({"t": rows, "other": -rows})
+    a, b = (data.load_dataset(str(tmp_path / f"{name}.h5"), num_steps=2) for name in "ab")
+    for joined, clips_of_all in ((data.ConcatDataset([a, b]), 16), (data.MergeDataset([a, b], [["t"], ["other"]]), 8)):
+        goals = data.GoalDataset(joined, (0.0, 0.5, 0.5, 0.0), goal_keys={"t": "goal_t", "other": "goal_other"}, seed=0)
+        assert len(goals) == clips_of_all and len(set(goals.clip_indices)) == clips_of_all
+        for sample in (goals[i] for i in range(len(goals))):
+            ahead = int(sample["goal_t"][0]) - int(sample["t"][-1])
+            assert 1 <= ahead <= 4 and int(sample["other"][-1]) - int(sample["goal_other"][0]) == ahead
+
+
 def test_scalers_normalise_and_invert(tmp_path):
     write(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance", num_steps=3, frameskip=2, backend="numpy")

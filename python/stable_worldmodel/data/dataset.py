@@ -465,6 +465,9 @@ class MergeDataset:
         """See :meth:`Dataset.load_episode`."""
         return self._picked(dataset.load_episode(episode_idx) for dataset in self.datasets)
 
+    def _load_slice(self, episode: int, start: int, end: int) -> dict[str, Any]:
+        return self._picked(dataset._load_slice(episode, start, end) for dataset in self.datasets)
+
     @property
     def episode_column_names(self) -> list[str]:
         """See :attr:`Dataset.episode_column_names`."""
@@ -580,6 +583,16 @@ class ConcatDataset:
         """See :meth:`Dataset.load_episode`."""
         parts, episodes = self._locate(self._episodes_before, [episode_idx], "episodes")
         return dict(self.datasets[int(parts[0])].load_episode(int(episodes[0])))
+
+    def _load_slice(self, episode: int, start: int, end: int) -> dict[str, Any]:
+        parts, episodes = self._locate(self._episodes_before, [episode], "episodes")
+        return dict(self.datasets[int(parts[0])]._load_slice(int(episodes[0]), start, end))
+
+    @property
+    def clip_indices(self) -> list[tuple[int, int]]:
+        """The episode and the first row of every clip."""
+        pairs = zip(self._episodes_before.tolist(), self.datasets, strict=False)
+        return [(before + episode, start) for before, dataset in pairs for episode, start in dataset.clip_indices]
 
     @property
     def episode_column_names(self) -> list[str]:

@@ -4,6 +4,8 @@
 use crate::arrays;
 use crate::errors::{from_py_err, to_py_err};
 use crate::model::Model;
+use numpy::{IxDyn, PyArrayDyn, PyArrayMethods as _, PyUntypedArrayMethods as _};
+use pyo3::ffi;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::cell::RefCell;
@@ -65,6 +67,8 @@ pub struct PythonCost {
     constrained: bool,
     /// The number of environments in the last observation.
     envs: usize,
+    /// The arrays of candidates.
+    buffers: RefCell<Buffers>,
     /// The error of a call in a trait method that cannot return errors; the next call returns this error.
     failed: RefCell<Option<Error>>,
 }
@@ -81,6 +85,7 @@ impl PythonCost {
             constrained: adapter.getattr("has_constraints")?.extract()?,
             adapter: adapter.clone().unbind(),
             envs: 0,
+            buffers: RefCell::default(),
             failed: RefCell::new(None),
         })
     }
@@ -96,6 +101,43 @@ impl PythonCost {
             return Err(error);
         }
         Python::attach(|py| work(self.adapter.bind(py))).map_err(from_py_err)
+    }
+}
+
+/// Arrays that are filled again as soon as nothing in Python refers to them, because new memory of their size costs page faults: more
+/// than the copy.
+#[derive(Default)]
+struct Buffers(Vec<Py<PyArrayDyn<f32>>>);
+
+impl Buffers {
+    /// The most arrays: that of the present call, one that the last call left, and a spare one.
+    const MOST: usize = 3;
+
+    /// Copies the candidates into an array `[envs, samples, horizon, dim]`.
+    fn filled<'py>(&mut self, py: Python<'py>, given: Candidates<'_>) -> PyResult<Bound<'py, PyAny>> {
+        let shape = [given.envs, given.samples, given.horizon, given.dim];
+        // Tensors and views refer to the array that owns the memory, which is one of these.
+        let is_free = |array: &Py<PyArrayDyn<f32>>| {
+            // SAFETY: the pointer is that of a living object, and this thread is attached to the interpreter.
+            #[allow(unsafe_code, reason = "PyO3 has no other way to count references")]
+            let references = unsafe { ffi::Py_REFCNT(array.as_ptr()) };
+            references == 1 && array.bind(py).shape() == shape
+        };
+        if let Some(array) = self.0.iter().find(|array| is_free(array)).map(|array| array.bind(py).clone())
+            && let Ok(mut free) = array.try_readwrite()
+            && let Ok(values) = free.as_slice_mut()
+        {
+            values.copy_from_slice(given.actions);
+            drop(free);
+            return Ok(array.into_any());
+        }
+        let array = PyArrayDyn::<f32>::zeros(py, IxDyn(&shape), false);
+        array.readwrite().as_slice_mut()?.copy_from_slice(given.actions);
+        if self.0.len() == Self::MOST {
+            self.0.remove(0);
+        }
+        self.0.push(array.clone().unbind());
+        Ok(array.into_any())
     }
 }
 
@@ -119,7 +161,8 @@ impl CostModel for PythonCost {
 
     fn cost(&mut self, given: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.call(|adapter| {
-            let returned = adapter.call_method1("cost", (candidates(adapter.py(), given)?,))?;
+            let candidates = self.buffers.borrow_mut().filled(adapter.py(), given)?;
+            let returned = adapter.call_method1("cost", (candidates,))?;
             let shape = [given.envs, given.samples];
             costs.copy_from_slice(&arrays::f32_values("the costs of the model", &returned, &shape)?);
             Ok(())
@@ -143,7 +186,8 @@ impl DifferentiableCost for PythonCost {
     fn cost_and_gradient(&mut self, given: Candidates<'_>, costs: &mut [f32], gradient: &mut [f32]) -> Result<()> {
         self.call(|adapter| {
             let shape = [given.envs, given.samples, given.horizon, given.dim];
-            let returned = adapter.call_method1("cost_and_gradient", (candidates(adapter.py(), given)?,))?;
+            let candidates = self.buffers.borrow_mut().filled(adapter.py(), given)?;
+            let returned = adapter.call_method1("cost_and_gradient", (candidates,))?;
             let (values, gradients): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
             costs.copy_from_slice(&arrays::f32_values("the costs of the model", &values, &shape[..2])?);
             gradient.copy_from_slice(&arrays::f32_values("the gradient of the model's costs", &gradients, &shape)?);

@@ -586,3 +586,29 @@ def test_policy_planned_in_python_belongs_to_the_world_that_took_it_last():
         first.step()
     first.set_policy(policy)
     first.step()
+
+
+def test_candidates_that_a_model_keeps_do_not_change():
+    """The engine fills arrays again that nothing refers to: not those of tensors, slices and views that are kept."""
+    kept = []
+
+    class Keeping:
+        def get_cost(self, infos, candidates):
+            for part in (candidates, candidates[:, 3:5], candidates.flatten(0, 1)[7]):
+                kept.append((part, part.clone()))
+            return candidates.square().sum((2, 3))
+
+    class Slices(Keeping):
+        backend = "numpy"
+
+        def get_cost(self, infos, candidates):
+            kept.extend((part, part.copy()) for part in (candidates[:, 1:2], candidates.reshape(-1)[5:9]))
+            return np.square(candidates).sum((2, 3))
+
+    space = gymnasium.spaces.Box(-1, 1, (2, 2), np.float32)
+    for model in (Keeping(), Slices()):
+        solver = solvers.CEMSolver(model, num_samples=20, n_steps=8, topk=4)
+        solver.configure(action_space=space, n_envs=2, config=swm.PlanConfig(horizon=3, receding_horizon=3))
+        solver.solve({"state": torch.zeros(2, 1)})
+    assert len(kept) == 8 * 5
+    assert all(bool((part == copy).all()) for part, copy in kept)

@@ -103,16 +103,17 @@ def _save(weights: Mapping[str, Any], file: Path, hashes: list[str]) -> None:
 
 def _marks(file: Path) -> list[str] | None:
     """The hashes in the mark of weights; `None` if `save_pretrained` did not write the file."""
-    if not file.is_file() or not zipfile.is_zipfile(file):
+    if not file.is_file():
         return None
-    with zipfile.ZipFile(file) as archive:
-        found = [name for name in archive.namelist() if name.partition("/")[2] == _MARK]
-        if not found or archive.getinfo(found[0]).file_size > 1 << 16:
-            return None
-        try:
-            hashes = json.loads(archive.read(found[0]))
-        except (OSError, ValueError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
-            return None
+    try:
+        with zipfile.ZipFile(file) as archive:
+            entries = [entry for entry in archive.infolist() if entry.filename.partition("/")[2] == _MARK]
+            # As `_save` writes it: not compressed.
+            stored = [entry for entry in entries if entry.compress_type == zipfile.ZIP_STORED and entry.file_size <= 1 << 16]
+            hashes = json.loads(archive.read(stored[0])) if stored else None
+    except (OSError, ValueError, RuntimeError, zipfile.BadZipFile):
+        # It is no archive, or damaged or encrypted.
+        return None
     return hashes if isinstance(hashes, list) else None
 
 

@@ -49,11 +49,6 @@ class Observer:
         self._options, self._smoothing, self._initial = options, smoothing, initial
         self._probs = initial
 
-    @property
-    def is_discrete(self) -> bool:
-        """Whether the distribution is one of discrete choices."""
-        return self._options is not None
-
     def begin(self, envs: int) -> None:
         """Begins a search for this many environments."""
         self._spread, self._probs = self._sigma, self._initial
@@ -128,24 +123,10 @@ class Observer:
         keep = self.momentum
         previous = np.broadcast_to(np.asarray(self._spread, np.float32), before.shape).copy()
         mean = keep * before + (1 - keep) * elites.mean(1)
-        self._widen(elites)
+        deviation = elites.std(1, ddof=1) if self.elites > 1 else np.zeros_like(before)
+        self._spread = keep * previous + (1 - keep) * deviation
         state = {"mean": mean, "var": self._spread, "prev_mean": before, "prev_var": previous}
         return {name: view(value) for name, value in state.items()}
-
-
-    def fit_spread(self, candidates: np.ndarray, costs: np.ndarray) -> None:
-        """What `fit` does to the distribution of continuous actions, without the values for callbacks."""
-        chosen = costs.argsort(axis=1, kind="stable")[:, : self.elites]
-        self._widen(candidates[np.arange(len(chosen))[:, None], chosen])
-
-    def _widen(self, elites: np.ndarray) -> None:
-        """Sets the standard deviation after an iteration with these elites `(B, K, H, dim)`."""
-        # As `numpy.std` with `ddof=1`, which takes longer than its sums.
-        count = elites.shape[1]
-        from_mean = elites - np.add.reduce(elites, axis=1, keepdims=True) / np.float32(count)
-        squares = np.add.reduce(from_mean * from_mean, axis=1)
-        deviation = np.sqrt(squares / np.float32(max(count - 1, 1)))
-        self._spread = np.float32(self.momentum) * self._spread + np.float32(1 - self.momentum) * deviation
 
 
 class Watched:
@@ -181,10 +162,7 @@ class Watched:
     def _fit(self) -> None:
         if self._last is not None:
             candidates, costs = self._last
-            if self.observer.is_discrete:
-                self.observer.fit(candidates, costs, np.argsort(costs, axis=1, kind="stable"))
-            else:
-                self.observer.fit_spread(candidates, costs)
+            self.observer.fit(candidates, costs, np.argsort(costs, axis=1, kind="stable"))
             self._last = None
 
 

@@ -3,7 +3,7 @@
     python benches/bench_pool.py [--swm PATH] [--pairs 3]
 
 Both sides step with random actions, in turns; the ratio is the median over the pairs of turns. The cost of a call is what
-`world.step(1)` takes more than one of the steps of `world.step(1000)`, which the engine takes without Python.
+`world.step(1)` takes more than one of the steps of `world.step(100)`, which the engine takes without Python.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def python(env: str, envs: int, side: int | None, seconds: float, chunk: int) ->
     return steps / (time.perf_counter() - begun)
 
 
-def call_cost(env: str, envs: int, side: int | None, turns: int = 15, steps: int = 1000) -> tuple[float, float]:
+def call_cost(env: str, envs: int, side: int | None, turns: int = 150, steps: int = 100) -> tuple[float, float]:
     """The median seconds of a call of `World.step` over the engine's step, and of that step."""
     shape = None if side is None else (side, side)
     world = swm.World(env, num_envs=envs, image_shape=shape, add_pixels=side is not None, max_episode_steps=EPISODE)

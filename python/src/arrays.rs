@@ -163,7 +163,17 @@ fn dtype_and_shape(value: &Bound<'_, PyAny>) -> Option<(DType, Vec<usize>)> {
 
 /// Copies the elements of a `float32` array, which must have the given shape. `what` names the array in errors.
 pub fn f32_values(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyResult<Vec<f32>> {
-    let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, f32>>() else {
+    let mut values = vec![0.0; shape.iter().product()];
+    copy_f32(what, given, shape, &mut values)?;
+    Ok(values)
+}
+
+/// Copies the elements of a `float32` array, which must have the given shape, to `to`. `what` names the array in errors.
+///
+/// # Panics
+/// If `to` does not have as many elements as the shape.
+pub fn copy_f32(what: &str, given: &Bound<'_, PyAny>, shape: &[usize], to: &mut [f32]) -> PyResult<()> {
+    let Ok(array) = given.cast::<PyArrayDyn<f32>>() else {
         return Err(PyTypeError::new_err(format!(
             "{what}: expected a float32 array of shape {shape:?}, got {given:?}"
         )));
@@ -172,7 +182,12 @@ pub fn f32_values(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyRe
         let message = format!("{what}: got shape {:?}, expected {shape:?}", array.shape());
         return Err(PyValueError::new_err(message));
     }
-    Ok(array.as_array().iter().copied().collect())
+    let array = array.try_readonly()?;
+    match array.as_slice() {
+        Ok(values) => to.copy_from_slice(values),
+        Err(_) => to.iter_mut().zip(array.as_array()).for_each(|(to, value)| *to = *value),
+    }
+    Ok(())
 }
 
 /// Creates a `float32` array of the given shape from its elements.

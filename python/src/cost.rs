@@ -163,9 +163,7 @@ impl CostModel for PythonCost {
         self.call(|adapter| {
             let candidates = self.buffers.borrow_mut().filled(adapter.py(), given)?;
             let returned = adapter.call_method1("cost", (candidates,))?;
-            let shape = [given.envs, given.samples];
-            costs.copy_from_slice(&arrays::f32_values("the costs of the model", &returned, &shape)?);
-            Ok(())
+            arrays::copy_f32("the costs of the model", &returned, &[given.envs, given.samples], costs)
         })
     }
 
@@ -189,9 +187,8 @@ impl DifferentiableCost for PythonCost {
             let candidates = self.buffers.borrow_mut().filled(adapter.py(), given)?;
             let returned = adapter.call_method1("cost_and_gradient", (candidates,))?;
             let (values, gradients): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
-            costs.copy_from_slice(&arrays::f32_values("the costs of the model", &values, &shape[..2])?);
-            gradient.copy_from_slice(&arrays::f32_values("the gradient of the model's costs", &gradients, &shape)?);
-            Ok(())
+            arrays::copy_f32("the costs of the model", &values, &shape[..2], costs)?;
+            arrays::copy_f32("the gradient of the model's costs", &gradients, &shape, gradient)
         })
     }
 }
@@ -205,9 +202,8 @@ impl LatentDynamics for PythonCost {
         let shape = [self.envs, self.latent_dim()];
         self.call(|adapter| {
             let (current, target): (Bound<'_, PyAny>, Bound<'_, PyAny>) = adapter.call_method0("encode")?.extract()?;
-            start.copy_from_slice(&arrays::f32_values("the latents of the current observation", &current, &shape)?);
-            goal.copy_from_slice(&arrays::f32_values("the latents of the goal", &target, &shape)?);
-            Ok(())
+            arrays::copy_f32("the latents of the current observation", &current, &shape, start)?;
+            arrays::copy_f32("the latents of the goal", &target, &shape, goal)
         })
     }
 
@@ -218,8 +214,7 @@ impl LatentDynamics for PythonCost {
             let given =
                 (arrays::f32_array(py, latents, &[n, dim])?, arrays::f32_array(py, actions, &[n, actions.len() / n])?);
             let returned = adapter.call_method1("predict", given)?;
-            next.copy_from_slice(&arrays::f32_values("the predicted latents", &returned, &[n, dim])?);
-            Ok(())
+            arrays::copy_f32("the predicted latents", &returned, &[n, dim], next)
         })
     }
 
@@ -243,9 +238,8 @@ impl LatentDynamics for PythonCost {
             let returned = adapter.call_method1("predict_vjp", given)?;
             let (latent, action): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
             let what = "the gradient of a prediction";
-            latent_gradient.copy_from_slice(&arrays::f32_values(what, &latent, &[n, dim])?);
-            action_gradient.copy_from_slice(&arrays::f32_values(what, &action, &[n, action_dim])?);
-            Ok(())
+            arrays::copy_f32(what, &latent, &[n, dim], latent_gradient)?;
+            arrays::copy_f32(what, &action, &[n, action_dim], action_gradient)
         })
     }
 }
@@ -263,8 +257,7 @@ impl Constrained for PythonCost {
         self.call(|adapter| {
             let returned = adapter.call_method1("constrain", (candidates(adapter.py(), given)?,))?;
             let shape = [given.envs, given.samples, n];
-            values.copy_from_slice(&arrays::f32_values("the constraints of the model", &returned, &shape)?);
-            Ok(())
+            arrays::copy_f32("the constraints of the model", &returned, &shape, values)
         })
     }
 

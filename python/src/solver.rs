@@ -14,10 +14,10 @@ use swm::core::run::Control;
 use swm::core::{Error, Key, PlanProblem, PlanSpace, SearchObserver, Solver};
 use swm::plan::{BetweenIterations, SOLVERS};
 
-/// Runs `work` in a thread pool that consists of the current thread.
+/// Runs `work` on the current thread, as a member of a thread pool.
 ///
-/// Solvers call the model from any thread of their pool, and Python handles signals only in the main thread. Ctrl-C
-/// therefore interrupts a Python model only if the pool is the main thread.
+/// Python handles signals only in the main thread, so that Ctrl-C interrupts a Python model only there. The other threads of
+/// the pool draw candidates.
 pub fn on_this_thread<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     thread_local! {
         // The pool is leaked, because it cannot be dropped before its thread ends.

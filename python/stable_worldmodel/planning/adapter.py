@@ -92,6 +92,8 @@ class Adapter:
         if hasattr(model, "eval") and self.torch and isinstance(model, _torch().nn.Module):
             model.eval()
         self.dtype = self._dtype()
+        #: Whether tensors of the model are float32 on the CPU, as the engine's arrays are.
+        self._as_engine = self.torch and _torch().device(device).type == "cpu" and self.dtype == _torch().float32
         self._infos: dict[str, Any] = {}
         self._envs = 0
         self._expanded_infos: dict[Any, dict[str, Any]] = {}
@@ -170,10 +172,12 @@ class Adapter:
             costs = np.concatenate([np.asarray(part) for part in parts])
             self._check_real(costs)
             return np.ascontiguousarray(costs, dtype=np.float32)
-        with _torch().inference_mode():
-            # A recorded cost is overwritten by the next one, so each goes to the CPU before the next.
-            parts = [self._numpy([self._cost(infos, part)]) for infos, part in self._parts(candidates, "cost")]
-            return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        if not _torch().is_inference_mode_enabled():
+            with _torch().inference_mode():
+                return self.cost(candidates)
+        # A recorded cost is overwritten by the next one, so each goes to the CPU before the next.
+        parts = [self._numpy([self._cost(infos, part)]) for infos, part in self._parts(candidates, "cost")]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The costs `(B, S)` of candidates `(B, S, H, A)` and their gradients `(B, S, H, A)`."""
@@ -246,7 +250,7 @@ class Adapter:
 
     def _cost(self, infos: dict[str, Any], candidates: Any) -> Any:
         """The costs of candidates on their device, recorded as CUDA graphs for models that allow it."""
-        if candidates.device.type != "cuda" or getattr(self.model, "prepare_plan", None) is None:
+        if self._as_engine or candidates.device.type != "cuda" or getattr(self.model, "prepare_plan", None) is None:
             return self._checked_cost(infos, candidates)
         from .capture import CapturedCosts
 
@@ -254,29 +258,32 @@ class Adapter:
 
     def _checked_cost(self, infos: dict[str, Any], candidates: Any) -> Any:
         cost = self.model.get_cost(infos, candidates)
-        expected = tuple(candidates.shape[:2])
-        if tuple(getattr(cost, "shape", ())) != expected:
+        expected = candidates.shape[:2]
+        if getattr(cost, "shape", None) != expected:
             got = tuple(cost.shape) if hasattr(cost, "shape") else type(cost).__name__
-            name = type(self.model).__name__
+            name, expected = type(self.model).__name__, tuple(expected)
             raise CostError(f"{name}.get_cost: expected costs of shape {expected} (environments, candidates), got {got}")
-        self._check_real(cost)
+        if cost.dtype != self.dtype:
+            self._check_real(cost)
         return cost if not isinstance(cost, np.ndarray) else _torch().from_numpy(cost)
 
     def _check_real(self, cost: Any) -> None:
-        if "complex" in str(cost.dtype):
+        if np.iscomplexobj(cost) if isinstance(cost, np.ndarray) else cost.is_complex():
             raise CostError(f"{type(self.model).__name__}.get_cost: expected real costs, got {cost.dtype}")
 
-    def _parts(self, candidates: np.ndarray, what: str) -> Any:
-        """Yields pairs of infos, repeated for every candidate, and candidates, for `batch_size` environments at a time."""
+    def _parts(self, candidates: np.ndarray, what: str) -> list[tuple[dict[str, Any], Any]]:
+        """Pairs of infos, repeated for every candidate, and candidates, for `batch_size` environments at a time."""
         envs, samples = candidates.shape[:2]
         size = self.batch_size or envs
+        parts = []
         for begin in range(0, envs, size):
+            part = candidates if size >= envs else candidates[begin : begin + size]
             key = (what, begin, samples)
-            rows = slice(begin, min(begin + size, envs))
-            part = candidates[rows]
-            if key not in self._expanded_infos:
-                self._expanded_infos[key] = self._expanded(rows, part)
-            yield self._expanded_infos[key], self._tensor(part) if self.torch else part
+            infos = self._expanded_infos.get(key)
+            if infos is None:
+                infos = self._expanded_infos[key] = self._expanded(slice(begin, begin + len(part)), part)
+            parts.append((infos, self._tensor(part) if self.torch else part))
+        return parts
 
     def _expanded(self, rows: slice, part: np.ndarray) -> dict[str, Any]:
         samples, dim = part.shape[1], part.shape[3]
@@ -301,8 +308,11 @@ class Adapter:
         return value.to(device=self.device, dtype=self.dtype if value.is_floating_point() else None)
 
     def _tensor(self, array: np.ndarray) -> Any:
-        return _torch().from_numpy(array).to(device=self.device, dtype=self.dtype)
+        tensor = _torch().from_numpy(array)
+        return tensor if self._as_engine else tensor.to(device=self.device, dtype=self.dtype)
 
     def _numpy(self, tensors: Sequence[Any]) -> np.ndarray:
         joined = tensors[0] if len(tensors) == 1 else _torch().cat(list(tensors))
-        return np.ascontiguousarray(joined.detach().to("cpu", _torch().float32).numpy())
+        if joined.requires_grad or not joined.is_cpu or joined.dtype != _torch().float32:
+            joined = joined.detach().to("cpu", _torch().float32)
+        return np.ascontiguousarray(joined.numpy())

@@ -153,6 +153,8 @@ class World:
         #: The options of resets, the same for all environments or one for each.
         self._reset_text: str | list[str] = _options.reset(None, {})
         self._fresh = np.ones(self.num_envs, bool)
+        #: Whether `_fresh` may be set: a call to numpy takes a tenth of a step call.
+        self._any_fresh = True
         #: The factors that resets sample, which the infos contain as `variation.KEY`.
         self._varied: list[str] = []
 
@@ -346,7 +348,9 @@ class World:
                 self._episodes[slot] = episode
             if begun:
                 self._show_factors([slot for slot, _ in begun])
-            self._fresh.fill(False)
+            if self._any_fresh:
+                self._fresh.fill(False)
+                self._any_fresh = False
             if self._frames:
                 self._transform()
             return
@@ -402,6 +406,7 @@ class World:
 
     def _begin(self, slots: Sequence[int]) -> None:
         self._fresh[list(slots)] = True
+        self._any_fresh = True
         # Those that act within a policy implemented in Python as well.
         for _, actor in self._actors.values():
             for slot in slots:

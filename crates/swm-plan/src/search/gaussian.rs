@@ -44,12 +44,13 @@ impl Gaussian {
         colour: Option<&ColouredNoise>,
         population: &mut Population,
     ) {
-        let (len, all) = (population.len(), population.samples() * population.len());
+        let (len, all, min_len) = (population.len(), population.samples() * population.len(), population.min_len());
         let Population { actions, keys, .. } = population;
-        actions.par_chunks_exact_mut(all).zip(distributions).enumerate().for_each(|(env, (candidates, gaussian))| {
+        let envs = actions.par_chunks_exact_mut(all).zip(distributions).enumerate().with_min_len(min_len);
+        envs.for_each(|(env, (candidates, gaussian))| {
             let key = keys[env].at(iteration as u64);
             // The noise of `RUN` candidates is a whole number of runs, so the noise of every task begins at a run.
-            let tasks = candidates.par_chunks_mut(RUN * len).enumerate();
+            let tasks = candidates.par_chunks_mut(RUN * len).enumerate().with_min_len(min_len);
             tasks.for_each_init(Vec::new, |scratch, (task, candidates)| {
                 normal_noise::fill(key, task * len, candidates);
                 for candidate in candidates.chunks_exact_mut(len) {

@@ -6,6 +6,7 @@ use super::problem::evaluate;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
+use std::time::{Duration, Instant};
 use swm_core::{Candidates, CostModel, Error, Iteration, Key, Plan, PlanProblem, PlanTrace, Result, limits};
 
 /// Candidate action sequences of several environments, and their costs.
@@ -19,7 +20,15 @@ pub struct Population {
     samples: usize,
     horizon: usize,
     dim: usize,
+    /// Whether the other threads of the pool sleep, or soon do: before the first evaluation, and after one that took long.
+    asleep: bool,
 }
+
+/// The number of values that one thread draws in less time (30 to 50 µs) than it takes to wake others.
+const SMALL: usize = 1 << 14;
+
+/// The time for which threads without work stay awake at least.
+const AWAKE: Duration = Duration::from_micros(5);
 
 /// The largest number of values of all candidates of one iteration.
 pub const MAX_VALUES: usize = limits::CANDIDATE_VALUES.max;
@@ -43,7 +52,8 @@ impl Population {
                 "plan with fewer samples, steps or parallel environments",
             ));
         };
-        Ok(Self { keys, samples, horizon, dim, actions: vec![0.0; values], costs: vec![0.0; envs * samples] })
+        let (actions, costs) = (vec![0.0; values], vec![0.0; envs * samples]);
+        Ok(Self { keys, samples, horizon, dim, actions, costs, asleep: true })
     }
 
     /// Creates a population around the initial guess: the first candidate is the guess, and every other candidate is
@@ -100,17 +110,26 @@ impl Population {
     /// When the model fails, or a cost is missing or not finite.
     pub fn evaluate(&mut self, cost: &mut dyn CostModel, iteration: usize) -> Result<()> {
         let (candidates, costs) = self.split();
-        evaluate(cost, candidates, iteration, costs)
+        let begun = Instant::now();
+        evaluate(cost, candidates, iteration, costs)?;
+        self.asleep = begun.elapsed() > AWAKE;
+        Ok(())
+    }
+
+    /// The fewest elements of a parallel iterator over the candidates that a thread takes: all of them if waking other threads takes
+    /// longer than drawing the candidates. This decides who draws a candidate, not its values.
+    pub(super) fn min_len(&self) -> usize {
+        if self.asleep && self.actions.len() <= SMALL { usize::MAX } else { 1 }
     }
 
     /// Calls `write(env, sample, key, candidate)` for every candidate, in parallel. `key` is derived from the
     /// environment's key and the iteration.
     pub fn write(&mut self, iteration: usize, write: impl Fn(usize, usize, Key, &mut [f32]) + Sync) {
-        let (len, all) = (self.len(), self.samples * self.len());
+        let (len, all, min_len) = (self.len(), self.samples * self.len(), self.min_len());
         let keys = &self.keys;
-        self.actions.par_chunks_exact_mut(all).enumerate().for_each(|(env, candidates)| {
+        self.actions.par_chunks_exact_mut(all).with_min_len(min_len).enumerate().for_each(|(env, candidates)| {
             let key = keys[env].at(iteration as u64);
-            let candidates = candidates.par_chunks_exact_mut(len).enumerate().with_min_len(RUN);
+            let candidates = candidates.par_chunks_exact_mut(len).enumerate().with_min_len(min_len.max(RUN));
             candidates.for_each(|(sample, candidate)| write(env, sample, key, candidate));
         });
     }

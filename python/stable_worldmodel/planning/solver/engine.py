@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,6 +21,12 @@ __all__ = ["EngineSolver", "NotConfigured", "last_step", "single", "summed_costs
 
 class NotConfigured(RuntimeError, AttributeError):
     """A property of a solver that `configure` sets was read before."""
+
+
+@lru_cache(maxsize=1)
+def _defaults() -> dict[str, dict[str, Any]]:
+    """The settings of the engine's solvers with their defaults, by the id of the solver. Do not change it."""
+    return json.loads(_engine.solvers())  # type: ignore[no-any-return]
 
 
 class EngineSolver:
@@ -48,7 +56,7 @@ class EngineSolver:
         #: The callbacks, which run after every iteration.
         self.callbacks = list(callbacks or ())
         self.model, self.batch_size, self.device, self.seed = model, batch_size, device, int(seed)
-        known = json.loads(_engine.solvers())[self.id]
+        known = _defaults()[self.id]
         self.settings: dict[str, Any] = {}
         #: Arguments of the constructor that are no settings of the engine.
         self._given: dict[str, Any] = {}
@@ -60,6 +68,8 @@ class EngineSolver:
             self.settings[engine] = value
         self._solved = 0
         self._action_space: spaces.Space[Any] | None = None
+        #: The action space of one environment; `None` until it is asked for.
+        self._single: spaces.Space[Any] | None = None
         self._n_envs, self._config = 0, None
 
     def __repr__(self) -> str:
@@ -69,6 +79,7 @@ class EngineSolver:
     def configure(self, *, action_space: spaces.Space[Any], n_envs: int, config: Any) -> None:
         """See `Solver.configure`."""
         self._action_space, self._n_envs, self._config = action_space, int(n_envs), config
+        self._single = None
 
     @property
     def cost(self) -> Any:
@@ -150,21 +161,22 @@ class EngineSolver:
         watched: Any = Watched(model, observer) if isinstance(model, Adapter) else None
         given = model if watched is None else watched
         observer.begin(envs)
-        actions, costs, trace = _engine.solve(
-            self.id,
-            json.dumps(self.settings),
-            given,
-            engine_infos,
-            envs,
-            horizon,
-            low,
-            high,
-            choices,
-            init,
-            self.seed,
-            self._solved,
-            observer if self.callbacks else None,
-        )
+        with self._mode(model):
+            actions, costs, trace = _engine.solve(
+                self.id,
+                json.dumps(self.settings),
+                given,
+                engine_infos,
+                envs,
+                horizon,
+                low,
+                high,
+                choices,
+                init,
+                self.seed,
+                self._solved,
+                observer if self.callbacks else None,
+            )
         observer.end()
         self._solved += 1
         result = {"actions": view(actions), "costs": costs.tolist(), "trace": json.loads(trace)}
@@ -173,13 +185,21 @@ class EngineSolver:
             result["callbacks"] = {callback.output_key: callback.history for callback in self.callbacks}
         return result
 
+    def _mode(self, model: Any) -> AbstractContextManager[Any]:
+        """Torch's inference mode, entered once for all iterations, if the engine computes nothing but costs in Python."""
+        if self._descends or self.callbacks or not (isinstance(model, Adapter) and model.torch):
+            return nullcontext()
+        import torch
+
+        return torch.inference_mode()
+
     def _outputs(self, result: dict[str, Any], watched: Watched | None) -> dict[str, Any]:
         """The entries of the result that only this solver has, or has otherwise; no `watched` for a checkpoint."""
         return {}
 
     def _all_settings(self) -> dict[str, Any]:
         """The settings, with the engine's defaults."""
-        return {**json.loads(_engine.solvers())[self.id], **self.settings}
+        return {**_defaults()[self.id], **self.settings}
 
     def _observer(self) -> Observer:
         """What reads the iterations of a search."""
@@ -221,10 +241,12 @@ class EngineSolver:
             raise NotConfigured(f"{type(self).__name__}: call configure(action_space=…, n_envs=…, config=…) first")
         return self._config
 
-    def _space(self) -> spaces.Space[Any]:
+    def _space(self) -> Any:
         self._configured()
-        space: spaces.Space[Any] = single(self._action_space, self._n_envs)
-        return space
+        if self._single is None:
+            # Gymnasium's constructors of spaces take as long as ten iterations of a small search.
+            self._single = single(self._action_space, self._n_envs)
+        return self._single
 
 
 def summed_costs(trace: list[dict[str, Any]], samples: int) -> list[list[float]]:

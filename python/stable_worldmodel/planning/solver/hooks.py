@@ -101,32 +101,36 @@ class Observer:
     def fit(self, candidates: np.ndarray, costs: np.ndarray, chosen: np.ndarray) -> dict[str, Any]:
         """The elites, whose indices are `chosen`, and the distribution after an iteration."""
         chosen = chosen[:, : self.elites]
-        elites = np.take_along_axis(candidates, chosen[:, :, None, None], 1)
         state = {"topk_vals": np.take_along_axis(costs, chosen, 1), "topk_inds": chosen}
         shared = {name: view(value) for name, value in state.items()}
+        elites, previous = self.advance(candidates, chosen)
+        if self._options is not None:
+            shaped = {"topk_candidates": elites, "probs": self._probs, "prev_probs": previous}
+            return {**shared, **{name: self._shaped(value) for name, value in shaped.items()}}
+        before, keep = candidates[:, 0], self.momentum
+        mean = keep * before + (1 - keep) * elites.mean(1)
+        moments = {"mean": mean, "var": self._spread, "prev_mean": before, "prev_var": previous}
+        return {**shared, "topk_candidates": view(elites), **{k: view(v) for k, v in moments.items()}, **self._limits}
+
+    def advance(self, candidates: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Fits the spread, or the probabilities, to the elites. Returns the elites and the values before."""
+        elites = candidates[np.arange(len(candidates))[:, None], chosen[:, : self.elites]]
+        shape, keep = elites[:, 0].shape, self.momentum
         if self._options is None:
-            return {**shared, "topk_candidates": view(elites), **self._gaussian(candidates[:, 0], elites), **self._limits}
-        keep, previous = self.momentum, np.broadcast_to(self._probs, elites[:, 0].shape).copy()
-        sizes = np.repeat(self._options, self._options).astype(np.float32)
-        smoothed = (elites.mean(1) + self._smoothing) / (1 + sizes * self._smoothing)
-        self._probs = (keep * previous + (1 - keep) * smoothed).astype(np.float32)
-        shaped = {"topk_candidates": elites, "probs": self._probs, "prev_probs": previous}
-        return {**shared, **{name: self._shaped(value) for name, value in shaped.items()}}
+            previous = np.broadcast_to(np.asarray(self._spread, np.float32), shape).copy()
+            deviation = elites.std(1, ddof=1) if self.elites > 1 else np.zeros(shape, np.float32)
+            self._spread = keep * previous + (1 - keep) * deviation
+        else:
+            previous = np.broadcast_to(self._probs, shape).copy()
+            sizes = np.repeat(self._options, self._options).astype(np.float32)
+            smoothed = (elites.mean(1) + self._smoothing) / (1 + sizes * self._smoothing)
+            self._probs = (keep * previous + (1 - keep) * smoothed).astype(np.float32)
+        return elites, previous
 
     def _shaped(self, values: np.ndarray) -> Any:
         """Values `(.., dim)` as `(.., choices, options)`, if all choices have equally many options."""
         shape = choice_shape(self._options or [])
         return view(values if shape is None else values.reshape(*values.shape[:-1], *shape))
-
-    def _gaussian(self, before: np.ndarray, elites: np.ndarray) -> dict[str, Any]:
-        """The moments after an iteration; `before` is the mean of the distribution, its first candidate."""
-        keep = self.momentum
-        previous = np.broadcast_to(np.asarray(self._spread, np.float32), before.shape).copy()
-        mean = keep * before + (1 - keep) * elites.mean(1)
-        deviation = elites.std(1, ddof=1) if self.elites > 1 else np.zeros_like(before)
-        self._spread = keep * previous + (1 - keep) * deviation
-        state = {"mean": mean, "var": self._spread, "prev_mean": before, "prev_var": previous}
-        return {name: view(value) for name, value in state.items()}
 
 
 class Watched:
@@ -162,7 +166,7 @@ class Watched:
     def _fit(self) -> None:
         if self._last is not None:
             candidates, costs = self._last
-            self.observer.fit(candidates, costs, np.argsort(costs, axis=1, kind="stable"))
+            self.observer.advance(candidates, np.argsort(costs, axis=1, kind="stable"))
             self._last = None
 
 

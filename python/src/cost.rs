@@ -2,7 +2,7 @@
 //! `stable_worldmodel.planning`.
 
 use crate::arrays;
-use crate::errors::{from_py_err, to_py_err};
+use crate::errors::{attached, to_py_err};
 use crate::model::Model;
 use numpy::{IxDyn, PyArrayDyn, PyArrayMethods as _, PyUntypedArrayMethods as _};
 use pyo3::ffi;
@@ -100,7 +100,7 @@ impl PythonCost {
         if let Some(error) = self.failed.take() {
             return Err(error);
         }
-        Python::attach(|py| work(self.adapter.bind(py))).map_err(from_py_err)
+        attached(|py| work(self.adapter.bind(py)))
     }
 }
 

@@ -34,6 +34,12 @@ pub fn from_py_err(error: PyErr) -> Error {
     Error::Embedder(Box::new(error))
 }
 
+/// Runs `work` in Python, for a thread of the engine. While the interpreter shuts down, there is nothing to call, and the thread is told
+/// to stop.
+pub fn attached<T>(work: impl FnOnce(Python<'_>) -> PyResult<T>) -> swm::core::Result<T> {
+    Python::try_attach(work).map_or(Err(Error::Interrupted), |outcome| outcome.map_err(from_py_err))
+}
+
 /// Creates a poll function for long loops. The function runs Python's signal handlers at most every 20 ms, so that
 /// Ctrl-C raises `KeyboardInterrupt`.
 pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
@@ -43,7 +49,7 @@ pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
             return Ok(());
         }
         last = Instant::now();
-        Python::attach(|py| py.check_signals()).map_err(from_py_err)
+        attached(|py| py.check_signals())
     }
 }
 
@@ -76,8 +82,8 @@ pub fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
         }
         last = Some(Instant::now());
         let steps = at.metric("steps").unwrap_or_default() as usize;
-        let outcome = Python::attach(|py| call.call1(py, (at.done, at.total, steps)).map(drop));
-        if let Err(error) = outcome {
+        let outcome = Python::try_attach(|py| call.call1(py, (at.done, at.total, steps)).map(drop));
+        if let Some(Err(error)) = outcome {
             callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }
     })

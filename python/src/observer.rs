@@ -1,7 +1,7 @@
 //! [`PythonObserver`]: reads the iterations of a search in Python.
 
 use crate::arrays;
-use crate::errors::from_py_err;
+use crate::errors::attached;
 use numpy::{PyArray1, PyArrayMethods as _};
 use pyo3::prelude::*;
 use std::ops::ControlFlow;
@@ -27,7 +27,7 @@ impl SearchObserver for PythonObserver {
     fn iteration(&self, iteration: &Iteration<'_>) -> Result<ControlFlow<()>> {
         let given = &iteration.candidates;
         let shape = [given.envs, given.samples, given.horizon, given.dim];
-        let stop = Python::attach(|py| {
+        let stop = attached(|py| {
             let elites = if iteration.elites.is_empty() {
                 None
             } else {
@@ -41,16 +41,16 @@ impl SearchObserver for PythonObserver {
             let arguments = (iteration.index, candidates, costs, elites, gradient);
             self.0.bind(py).call_method1("iteration", arguments)?.extract::<bool>()
         });
-        Ok(if stop.map_err(from_py_err)? { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
+        Ok(if stop? { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
     }
 }
 
 impl PlanObserver for PythonObserver {
     fn begin(&self, slots: &[usize]) -> Result<()> {
-        Python::attach(|py| self.0.bind(py).call_method1("begin", (slots.len(),)).map(drop)).map_err(from_py_err)
+        attached(|py| self.0.bind(py).call_method1("begin", (slots.len(),)).map(drop))
     }
 
     fn end(&self) -> Result<()> {
-        Python::attach(|py| self.0.bind(py).call_method0("end").map(drop)).map_err(from_py_err)
+        attached(|py| self.0.bind(py).call_method0("end").map(drop))
     }
 }

@@ -1,7 +1,7 @@
 //! [`Actor`]: a policy bound to a world, implemented in the engine or in Python.
 
 use crate::cost::planning_model;
-use crate::errors::{from_py_err, json, to_py_err};
+use crate::errors::{attached, json, to_py_err};
 use crate::observer::PythonObserver;
 use crate::world::World;
 use crate::{arrays, solver};
@@ -234,7 +234,7 @@ impl Policy for PythonPolicy {
 
     fn act(&mut self, _infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let Self { call, infos, fresh } = self;
-        let called = Python::attach(|py| {
+        let called = attached(|py| {
             // Copies: a policy that changes its observation must not change what the engine stores.
             let given = PyDict::new(py);
             for (name, column) in infos.bind(py) {
@@ -246,7 +246,7 @@ impl Policy for PythonPolicy {
             arrays::fill(actions, 0, &given)
         });
         fresh.fill(false);
-        called.map_err(from_py_err)
+        called
     }
 
     fn uses_threads(&self) -> bool {

@@ -329,6 +329,8 @@ class MPCPolicy(BasePolicy):
         scale = _scale(self.process.get("action"))
         if not isinstance(self.solver, EngineSolver) or (scale is None and "action" in self.process):
             return None
+        # Another world may have taken the solver meanwhile.
+        self.solver.configure(action_space=world.envs.action_space, n_envs=world.num_envs, config=self.cfg)
         in_engine = self.solver.model == "simulator" or hasattr(self.solver.model, "_engine_model")
         if world.transforms and not in_engine:
             # Transforms of frames are functions in Python, so the solver is called from here.

@@ -26,7 +26,8 @@ class Costable(Protocol):
             info_dict: The infos, each `(B, S, T, ..)` with T steps of history (`history_len` of the plan config): `pixels`,
                 `goal` and the other columns. Entries that the model adds remain for the rest of the search, so the
                 model can cache an encoding in `info_dict`.
-            action_candidates: The candidates `(B, S, H, A)`.
+            action_candidates: The candidates `(B, S, H, A)`, a copy. The final `var` or `probs` of a result come from it: a
+                model that changes it in place changes those, but not the plans.
         """
         ...
 

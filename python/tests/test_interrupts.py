@@ -299,3 +299,17 @@ def test_training_reports_wrong_arguments():
         swm.wm.train("lewm", data="nothing", out="mine")
     with pytest.raises(ValueError, match="schedule.steps"):
         swm.wm.train("lewm", data="nothing", out="mine", schedul__steps=3)
+
+
+@pytest.mark.parametrize("play", ["collect(writer=swm.data.ReplayBuffer(100), episodes=10**6", "evaluate(episodes=10**6"])
+def test_program_ends_silently_while_a_thread_plays(play):
+    program = f"""
+import threading, time
+import stable_worldmodel as swm
+world = swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False, max_episode_steps=25)
+world.set_policy(swm.policy.RandomPolicy(seed=0))
+threading.Thread(target=lambda: world.{play}, progress=False), daemon=True).start()
+"""
+    for _ in range(3):
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stderr) == (0, "")

@@ -588,6 +588,29 @@ def test_policy_planned_in_python_belongs_to_the_world_that_took_it_last():
     first.step()
 
 
+def test_policy_of_the_engine_plans_for_the_world_that_plays():
+    """Another world, with other actions, took its solver meanwhile."""
+    shapes = set()
+
+    class Shapes(swm.solver.callbacks.Callback):
+        def compute(self, candidates, action_low, **state):
+            shapes.add((candidates.shape[3], len(action_low)))
+
+    class Small:
+        def get_cost(self, infos, candidates):
+            return candidates.square().sum((2, 3))
+
+    policy = swm.policy.MPCPolicy(few(solvers.ICEMSolver, Small(), callbacks=[Shapes()]), swm.PlanConfig(2, 2))
+    first = swm.World("swm/TwoRoom-v1", num_envs=1, add_pixels=False, max_episode_steps=4)
+    second = swm.World("swm/PendulumControl-v1", num_envs=1, add_pixels=False, max_episode_steps=4)
+    first.set_policy(policy)
+    second.set_policy(policy)
+    for world, dim in ((first, 2), (second, 1), (first, 2)):
+        shapes.clear()
+        world.evaluate(episodes=1, seed=0, floor=False, progress=False)
+        assert shapes == {(dim, dim)}
+
+
 def test_candidates_that_a_model_keeps_do_not_change():
     """The engine fills arrays again that nothing refers to: not those of tensors, slices and views that are kept."""
     kept = []

@@ -1,6 +1,7 @@
 """Tests of objectives, evaluators and callbacks of solvers."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -342,3 +343,44 @@ def test_initial_actions_are_extended_by_zeros_or_by_the_policy_of_the_model():
     assert prepare_init_action(None, {}, given, 1, 2, 3) is given
     with pytest.raises(ValueError, match=r"\(2, 1, 3\)"):
         prepare_init_action(None, {}, given, 3, 2, 4)
+
+
+def test_costs_in_a_reused_buffer_belong_to_their_environments():
+    class Reusing(torch.nn.Module):
+        def __init__(self, kind):
+            super().__init__()
+            self.out, self.backend = torch.empty(1000), kind
+
+        def get_cost(self, info_dict, action_candidates):
+            out = self.out[: action_candidates.shape[0] * action_candidates.shape[1]].view(action_candidates.shape[:2])
+            with torch.no_grad():
+                out.copy_(ToTarget().get_cost(*map(as_tensors, (info_dict, action_candidates))))
+            return out if self.backend == "torch" else out.numpy()
+
+    def as_tensors(given):
+        return (
+            {key: torch.as_tensor(value) for key, value in given.items()} if isinstance(given, dict) else torch.as_tensor(given)
+        )
+
+    for kind in ("torch", "numpy"):
+        plans = []
+        for size in (None, 1, 2):
+            solver = planning.CEMSolver(Reusing(kind), batch_size=size, num_samples=100, n_steps=15, topk=10, seed=0)
+            solver.configure(action_space=BOX, n_envs=3, config=swm.PlanConfig(1, 1))
+            plans.append(solver.solve(infos())["actions"])
+        assert (plans[0][:, 0] - TARGETS).abs().max() < 0.05
+        assert torch.equal(plans[0], plans[1]) and torch.equal(plans[0], plans[2]), kind
+
+
+def test_gradient_solvers_search_within_inference_mode():
+    solver = configured(planning.GradientSolver(ToTarget(), n_steps=100, num_samples=2))
+    with torch.inference_mode():
+        plan = solver.solve({key: value.clone() for key, value in infos().items()})["actions"]
+    assert (plan - TARGETS[:, None]).abs().max() < 0.1
+
+
+def test_threads_that_share_a_solver_get_numbers_of_their_own():
+    solver = configured(planning.CEMSolver(ToTarget(), num_samples=8, n_steps=1, topk=2))
+    with ThreadPoolExecutor(4) as threads:
+        plans = list(threads.map(lambda _: solver.solve(infos())["actions"].numpy().tobytes(), range(40)))
+    assert len(set(plans)) == 40

@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import threading
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -74,6 +75,24 @@ def test_models_are_saved_and_loaded(home):
         load_pretrained("mine")
     with pytest.raises(FileNotFoundError, match="nothing"):
         load_pretrained("nothing")
+
+
+def test_weights_with_the_configuration_of_others_are_loaded_with_a_warning(home):
+    def config(name):
+        return {"_target_": "torch.nn.Sequential", "_args_": [{"_target_": f"torch.nn.{name}"}]}
+
+    save_pretrained(torch.nn.Sequential(torch.nn.Tanh()), "run", config("Tanh"), filename="first.pt")
+    folder = home / "checkpoints" / "run"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_pretrained(folder / "first.pt")
+    save_pretrained(torch.nn.Sequential(torch.nn.ReLU()), "run", config("ReLU"), filename="second.pt")
+    with pytest.warns(UserWarning, match="first.pt was saved with another configuration"):
+        load_pretrained(folder / "first.pt")
+    with pytest.warns(UserWarning, match="saved without a config"):
+        save_pretrained(torch.nn.Sequential(torch.nn.Tanh()), "run", filename="third.pt")
+    with pytest.warns(UserWarning, match="third.pt was saved without a configuration"):
+        load_pretrained(folder / "third.pt")
 
 
 def test_models_are_replaced_as_a_whole_and_checkpoints_of_the_engine_are_not(home):

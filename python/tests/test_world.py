@@ -349,6 +349,41 @@ def test_restored_snapshot_repeats_the_next_step():
     assert np.array_equal(world.infos["state"], after)
 
 
+@pytest.mark.parametrize("evaluated", [False, True])
+def test_restored_snapshot_goes_on_in_a_world_without_episodes(evaluated):
+    world = rooms(num_envs=2)
+    world.set_policy(Zero(0.7))
+    world.reset(seed=0)
+    state = world.snapshot(1)
+    world.step()
+    after = world.infos["state"][1].copy()
+    other = world if evaluated else rooms(num_envs=2)
+    other.set_policy(Zero(0.7))
+    if evaluated:
+        other.evaluate(episodes=2, seed=3, floor=False, progress=False)
+    other.restore(state, 1)
+    other.step()
+    assert np.array_equal(other.infos["state"][1], after)
+
+
+def test_interrupted_evaluation_ends_the_interactive_loop():
+    class Interrupting(swm.policy.BasePolicy):
+        def get_action(self, infos, **kwargs):
+            raise KeyboardInterrupt
+
+    world = rooms(num_envs=1)
+    world.set_policy(Zero())
+    world.reset(seed=0)
+    world.step(3)
+    for play in (
+        lambda: world.evaluate(episodes=1, policy=Interrupting(), progress=False),
+        lambda: world.collect(writer=swm.data.ReplayBuffer(100), episodes=1, policy=Interrupting(), progress=False),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            play()
+        assert world.seed is None
+
+
 def test_numbers_of_steps_are_whole_and_actions_are_numbers():
     world = swm.World("swm/TwoRoom-v1", num_envs=1, add_pixels=False)
     world.set_policy(swm.policy.RandomPolicy(1))

@@ -2,7 +2,7 @@
 
 use super::{Column, described, schema};
 use crate::arrays;
-use crate::errors::from_py_err;
+use crate::errors::attached;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use swm::core::columns::{EPISODE_IDX, STEP_IDX};
@@ -37,16 +37,13 @@ impl ForeignReader {
     }
 
     fn rows(&self, column: &str, range: &StepRange) -> Result<Batch> {
-        let read = || {
-            Python::attach(|py| {
-                let arguments = (column, range.episode, range.start, range.length);
-                let rows = self.object.bind(py).call_method1("rows", arguments)?;
-                let dict = PyDict::new(py);
-                dict.set_item(column, rows)?;
-                arrays::batch(&dict)
-            })
-        };
-        let rows: Batch = read().map_err(from_py_err)?;
+        let rows: Batch = attached(|py| {
+            let arguments = (column, range.episode, range.start, range.length);
+            let rows = self.object.bind(py).call_method1("rows", arguments)?;
+            let dict = PyDict::new(py);
+            dict.set_item(column, rows)?;
+            arrays::batch(&dict)
+        })?;
         let (given, expected) = (&rows.schema().columns()[0], self.schema.column(column)?);
         if given == expected && rows.rows() == range.length {
             return Ok(rows);
@@ -136,7 +133,7 @@ impl Writer for ForeignWriter {
             }
             self.object.call_method1(py, "write_episode", (dict,))
         };
-        Python::attach(write).map_err(from_py_err)?;
+        attached(write)?;
         self.episodes += 1;
         Ok(())
     }

@@ -67,8 +67,8 @@ fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let Some(progress) = progress else { return control };
     control.with_events(move |event| {
         let Event::Progress(at) = event else { return };
-        let outcome = Python::attach(|py| progress.call1(py, (at.stage, at.done, at.total)).map(drop));
-        if let Err(error) = outcome {
+        let outcome = Python::try_attach(|py| progress.call1(py, (at.stage, at.done, at.total)).map(drop));
+        if let Some(Err(error)) = outcome {
             callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }
     })

@@ -168,22 +168,24 @@ class Adapter:
     def cost(self, candidates: np.ndarray) -> np.ndarray:
         """The costs `(B, S)` of candidates `(B, S, H, A)`."""
         if not self.torch:
-            parts = [self.model.get_cost(infos, part) for infos, part in self._parts(candidates, "cost")]
-            costs = np.concatenate([np.asarray(part) for part in parts])
+            # A model may write the costs of the next environments over these.
+            costs = np.concatenate([np.array(self.model.get_cost(*part)) for part in self._parts(candidates, "cost")])
             self._check_real(costs)
             return np.ascontiguousarray(costs, dtype=np.float32)
         if not _torch().is_inference_mode_enabled():
             with _torch().inference_mode():
                 return self.cost(candidates)
-        # A recorded cost is overwritten by the next one, so each goes to the CPU before the next.
-        parts = [self._numpy([self._cost(infos, part)]) for infos, part in self._parts(candidates, "cost")]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        parts = self._parts(candidates, "cost")
+        if len(parts) == 1:
+            return self._numpy([self._cost(*parts[0])])
+        # A model may write the costs of the next environments over these, so each is copied before the next.
+        return np.concatenate([self._numpy([self._cost(infos, part)]).copy() for infos, part in parts])
 
     def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The costs `(B, S)` of candidates `(B, S, H, A)` and their gradients `(B, S, H, A)`."""
         torch = _torch()
         costs, gradients = [], []
-        with torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad():
             for infos, part in self._parts(candidates, "gradient"):
                 part = part.requires_grad_()
                 cost = self._checked_cost(infos, part)
@@ -193,7 +195,7 @@ class Adapter:
                 # The cost of a candidate depends on its own actions only, so the gradient of the sum holds all gradients.
                 # Values that the model cached in its infos may belong to an older graph, so graphs are retained.
                 (gradient,) = torch.autograd.grad(cost.sum(), part, retain_graph=True)
-                costs.append(cost.detach())
+                costs.append(cost.detach().clone())
                 gradients.append(gradient)
         return self._numpy(costs), self._numpy(gradients)
 
@@ -212,7 +214,7 @@ class Adapter:
     def predict_vjp(self, latents: np.ndarray, actions: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The vector-Jacobian products of a prediction, `(N, D)` and `(N, A)`, for the output gradient `gradient` `(N, D)`."""
         torch = _torch()
-        with torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad():
             given = self._tensor(latents).requires_grad_(), self._tensor(actions).requires_grad_()
             predicted = self.dynamics.predict(*given)
             gradients = torch.autograd.grad(predicted, given, self._tensor(gradient), allow_unused=True)
@@ -230,13 +232,13 @@ class Adapter:
         """Constraint values `(B, S, C)`, satisfied when at most 0."""
         with _torch().inference_mode():
             parts = self._parts(candidates, "constrain")
-            return self._numpy([self.model.get_constraints(infos, part) for infos, part in parts])
+            return self._numpy([self.model.get_constraints(infos, part).clone() for infos, part in parts])
 
     def constrain_vjp(self, candidates: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """The gradient of the constraints with respect to the candidates, weighted by `weights` `(B, S, C)`."""
         torch = _torch()
         gradients, at = [], 0
-        with torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad():
             for infos, part in self._parts(candidates, "constrain gradient"):
                 part = part.requires_grad_()
                 values = self.model.get_constraints(infos, part)

@@ -73,13 +73,17 @@ def save_pretrained(
         raise ValueError(f"filename: expected a plain name for the weights, such as 'weights.pt', got {filename!r}")
     if (folder / "weights.safetensors").exists():
         raise FileExistsError(f"{folder}: it holds a checkpoint of the engine; choose another run_name")
-    old = [_hash(settings.read_bytes())] if _is_own_settings(settings) else []
-    is_other = config is not None and os.path.lexists(settings) and not old
-    for file in [stored] * (os.path.lexists(stored) and _marks(stored) is None) + [settings] * is_other:
-        raise FileExistsError(f"{file}: save_pretrained did not write this file; choose another run_name")
     folder.mkdir(parents=True, exist_ok=True)
-    weights, hashes = model.state_dict(), old
-    files: dict[Path, Callable[[Path], object]] = {stored: lambda beside: _save(weights, beside, hashes)}
+    # Another process may replace both files.
+    with _files.locked(folder, exclusive=False):
+        old = [_hash(settings.read_bytes())] if _is_own_settings(settings) else []
+        is_other = config is not None and os.path.lexists(settings) and not old
+        for file in [stored] * (os.path.lexists(stored) and _mark(stored) is None) + [settings] * is_other:
+            raise FileExistsError(f"{file}: save_pretrained did not write this file; choose another run_name")
+    weights = model.state_dict()
+    # The old configuration as well, because a kill may come before it is replaced.
+    mark: dict[str, Any] = {"config": None, "before": old}
+    files: dict[Path, Callable[[Path], object]] = {stored: lambda beside: _save(weights, beside, mark)}
     if config is None:
         warnings.warn(f"{folder}: saved without a config, so load_pretrained cannot build the model", stacklevel=2)
     else:
@@ -87,22 +91,21 @@ def save_pretrained(
         if len(text) > _MOST_SETTINGS:
             raise ValueError(f"config: it has {len(text)} characters, more than the {_MOST_SETTINGS} that are read again")
         encoded = text.encode()
-        # The old one as well, because a kill may come before it is replaced.
-        hashes = [*old, _hash(encoded)]
+        mark["config"] = _hash(encoded)
         files[settings] = lambda beside: beside.write_bytes(encoded)
     _files.replace(files)
 
 
-def _save(weights: Mapping[str, Any], file: Path, hashes: list[str]) -> None:
-    """Writes weights with a mark: the hashes of the configurations that are written with them."""
+def _save(weights: Mapping[str, Any], file: Path, mark: Mapping[str, Any]) -> None:
+    """Writes weights with a mark: the hash of their configuration as `config`, and as `before` those that it replaces."""
     torch.save(weights, file)
     with zipfile.ZipFile(file, "a") as archive:
         root = archive.namelist()[0].partition("/")[0]
-        archive.writestr(zipfile.ZipInfo(f"{root}/{_MARK}"), json.dumps(hashes))
+        archive.writestr(zipfile.ZipInfo(f"{root}/{_MARK}"), json.dumps(mark))
 
 
-def _marks(file: Path) -> list[str] | None:
-    """The hashes in the mark of weights; `None` if `save_pretrained` did not write the file."""
+def _mark(file: Path) -> dict[str, Any] | None:
+    """The mark of weights; `None` if `save_pretrained` did not write the file."""
     if not file.is_file():
         return None
     try:
@@ -110,11 +113,11 @@ def _marks(file: Path) -> list[str] | None:
             entries = [entry for entry in archive.infolist() if entry.filename.partition("/")[2] == _MARK]
             # As `_save` writes it: not compressed.
             stored = [entry for entry in entries if entry.compress_type == zipfile.ZIP_STORED and entry.file_size <= 1 << 16]
-            hashes = json.loads(archive.read(stored[0])) if stored else None
+            mark = json.loads(archive.read(stored[0])) if stored else None
     except (OSError, ValueError, RuntimeError, zipfile.BadZipFile):
         # It is no archive, or damaged or encrypted.
         return None
-    return hashes if isinstance(hashes, list) else None
+    return mark if isinstance(mark, dict) and isinstance(mark.get("before"), list) else None
 
 
 def _is_own_settings(file: Path) -> bool:
@@ -122,7 +125,8 @@ def _is_own_settings(file: Path) -> bool:
     if not file.is_file() or file.stat().st_size > _MOST_SETTINGS:
         return False
     hash = _hash(file.read_bytes())
-    return any(hash in (_marks(other) or ()) for other in file.parent.iterdir())
+    marks = [mark for other in file.parent.iterdir() if (mark := _mark(other)) is not None]
+    return any(hash in (mark.get("config"), *mark["before"]) for mark in marks)
 
 
 def _hash(content: bytes) -> str:
@@ -173,6 +177,10 @@ def load_pretrained(
     # Another process may replace both files.
     with _files.locked(file.parent, exclusive=False):
         config, weights = _read_settings(settings), read_state_dict(file)
+        mark = _mark(file)
+        if mark is not None and mark.get("config") != _hash(settings.read_bytes()):
+            saved = "without a configuration" if mark.get("config") is None else "with another configuration"
+            warnings.warn(f"{file} was saved {saved}; {settings} may describe another model", stacklevel=2)
     for key, value in (extra_args or {}).items():
         *groups, last = key.split(".")
         part = config

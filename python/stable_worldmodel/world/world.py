@@ -389,8 +389,14 @@ class World:
 
     def restore(self, state: bytes, index: int = 0) -> None:
         """Restores a snapshot and refreshes `infos`. The same actions repeat the steps after the snapshot bit for bit; the
-        policy, of which a snapshot has nothing, goes on as it was."""
-        self._world.restore(self._checked_index(index), state)
+        policy, of which a snapshot has nothing, goes on as it was. `step_idx` and the time limit count from the snapshot.
+
+        In a world without episodes (before the first `reset`, after `collect` or `evaluate`), the other environments start one.
+        """
+        index = self._checked_index(index)
+        if self.seed is None:
+            self.reset()
+        self._world.restore(index, state)
         self._show_factors([index])
         self._transform()
 
@@ -595,11 +601,13 @@ class World:
     ) -> dict[str, int]:
         from ..data.writer import codec_json
 
-        with _progress.bar("collect", config["episodes"], progress) as bar:
-            outcome = self._world.collect(
-                self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
-            )
-        self._end_interactive_loop()
+        try:
+            with _progress.bar("collect", config["episodes"], progress) as bar:
+                outcome = self._world.collect(
+                    self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
+                )
+        finally:
+            self._end_interactive_loop()
         *counts, warning = outcome
         if warning is not None:
             warnings.warn(warning, stacklevel=3)
@@ -690,16 +698,18 @@ class World:
         if floor and acting[0][0] != "random":
             acting.append(("random", _engine.Actor.random(self._world, None)))
         runs: list[dict[str, Any]] = []
-        for name, actor in acting:
-            recording = None
-            if video is not None and not runs:
-                folder = _files.local("video", video)
-                folder.mkdir(parents=True, exist_ok=True)
-                recording = [str(folder), "episode", episodes if videos is None else int(videos)]
-            given = json.dumps({**config, "policy": name, "videos": recording})
-            with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
-                runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
-        self._end_interactive_loop()
+        try:
+            for name, actor in acting:
+                recording = None
+                if video is not None and not runs:
+                    folder = _files.local("video", video)
+                    folder.mkdir(parents=True, exist_ok=True)
+                    recording = [str(folder), "episode", episodes if videos is None else int(videos)]
+                given = json.dumps({**config, "policy": name, "videos": recording})
+                with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
+                    runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
+        finally:
+            self._end_interactive_loop()
         if hasattr(policy, "plans"):
             policy.plans = json.loads(acting[0][1].take_plans())
         return Metrics._of(self, config, runs, dataset)

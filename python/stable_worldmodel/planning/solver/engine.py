@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
+from threading import Lock
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +18,10 @@ from .callbacks import Callback
 from .hooks import Observer, Watched, view
 
 __all__ = ["EngineSolver", "NotConfigured", "last_step", "single", "summed_costs"]
+
+
+#: Held while a call of `solve` takes its number; not by the solvers, because locks cannot be pickled.
+_COUNTING = Lock()
 
 
 class NotConfigured(RuntimeError, AttributeError):
@@ -161,6 +166,8 @@ class EngineSolver:
         watched: Any = Watched(model, observer) if isinstance(model, Adapter) else None
         given = model if watched is None else watched
         observer.begin(envs)
+        with _COUNTING:
+            call, self._solved = self._solved, self._solved + 1
         with self._mode(model):
             actions, costs, trace = _engine.solve(
                 self.id,
@@ -174,11 +181,10 @@ class EngineSolver:
                 choices,
                 init,
                 self.seed,
-                self._solved,
+                call,
                 observer if self.callbacks else None,
             )
         observer.end()
-        self._solved += 1
         result = {"actions": view(actions), "costs": costs.tolist(), "trace": json.loads(trace)}
         result |= self._outputs(result, watched)
         if self.callbacks:
@@ -208,7 +214,7 @@ class EngineSolver:
         elites = 0 if self._descends else int(settings.get("elites", 1))
         sigma, momentum = float(settings.get("sigma", 0.0)), float(settings.get("momentum", 0.0))
         space: Any = self._space()
-        limits = (space.low, space.high) if isinstance(space, spaces.Box) and self.id == "icem" else None
+        limits = (space.low.copy(), space.high.copy()) if isinstance(space, spaces.Box) and self.id == "icem" else None
         return Observer(self.callbacks, elites, sigma, momentum, limits)
 
     def __getattr__(self, name: str) -> Any:

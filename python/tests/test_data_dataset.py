@@ -258,6 +258,30 @@ def test_goals_of_joined_datasets_are_rows_of_the_same_episode(tmp_path):
             assert 1 <= ahead <= 4 and int(sample["other"][-1]) - int(sample["goal_other"][0]) == ahead
 
 
+def test_joined_datasets_follow_buffers_that_grow():
+    def add(buffer, length, value):
+        state = np.full((length, 1), value, np.float32)
+        buffer.write_episode({"state": state, "action": np.zeros((length, 2), np.float32)})
+
+    first, second = data.ReplayBuffer(200), data.ReplayBuffer(200)
+    add(first, 5, 1)
+    add(second, 7, 100)
+    joined = data.ConcatDataset([first, second])
+    goals = data.GoalDataset(joined, (0.0, 0.5, 0.5, 0.0), goal_keys={"state": "goal_state"}, seed=0)
+    for length, value in ((6, 2), (4, 3)):
+        add(first, length, value)
+        expected = np.concatenate([np.asarray(part.get_col_data("state")) for part in (first, second)])[:, 0]
+        assert joined.num_episodes == len(joined.lengths) and len(joined) == len(first) + len(second)
+        assert np.asarray(joined.get_row_data(np.arange(len(expected)))["state"]).ravel().tolist() == expected.tolist()
+        starts = joined.offsets
+        for index, n in enumerate(joined.lengths.tolist()):
+            rows = np.asarray(joined.load_episode(index)["state"]).ravel()
+            assert len(rows) == n and (rows == expected[starts[index]]).all()
+        samples = [goals[i] for i in range(len(goals))]
+        assert all(float(sample["state"].ravel()[0]) == float(sample["goal_state"].ravel()[0]) for sample in samples)
+        assert {float(sample["state"].ravel()[0]) for sample in samples} == set(expected.tolist())
+
+
 def test_scalers_normalise_and_invert(tmp_path):
     write(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance", num_steps=3, frameskip=2, backend="numpy")

@@ -388,6 +388,7 @@ def test_null_stands_for_a_missing_option():
         (["lewm", "data=nothing", "data=other"], 2, "given twice"),
         (["lewm", "data="], 2, "is empty"),
         (["lewm", "data=nothing", "out="], 2, "out: the name of the checkpoint is empty"),
+        (["lewm", "data=nothing", "out=s3://bucket/run"], 2, "out: 's3://bucket/run' is a URI"),
         (["lewm", "data=nothing", "threads=1000000"], 2, "threads: 1000000; expected 0 to 1024"),
         (["lewm", "data=nothing", "compile=nope"], 2, "compile: 'nope'; expected true, false or a backend"),
         (["lewm"], 2, "data=PATH"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import re
@@ -500,9 +501,20 @@ class ConcatDataset:
             raise ValueError("ConcatDataset: expected at least one dataset")
         self.datasets = list(datasets)
         _check_same_clips("ConcatDataset", self.datasets)
-        self._clips_before = np.cumsum([0, *(len(dataset) for dataset in self.datasets)])
-        self._episodes_before = np.cumsum([0, *(len(dataset.lengths) for dataset in self.datasets)])
-        self._rows_before = np.cumsum([0, *(int(np.sum(dataset.lengths)) for dataset in self.datasets)])
+
+    # Counted at every call, because a `ReplayBuffer` grows.
+
+    @property
+    def _clips_before(self) -> Array:
+        return np.cumsum([0, *(len(dataset) for dataset in self.datasets)])
+
+    @property
+    def _episodes_before(self) -> Array:
+        return np.cumsum([0, *(len(dataset.lengths) for dataset in self.datasets)])
+
+    @property
+    def _rows_before(self) -> Array:
+        return np.cumsum([0, *(int(np.sum(dataset.lengths)) for dataset in self.datasets)])
 
     @property
     def column_names(self) -> list[str]:
@@ -629,6 +641,20 @@ def _items(dataset: Any, indices: Sequence[int]) -> list[dict[str, Any]]:
     return [dataset[i] for i in indices]
 
 
+def _at_this_moment(dataset: Any, last: Any) -> Any:
+    """The dataset with the present content of its replay buffers; `last`, which this returned before, if none has changed."""
+    if not isinstance(dataset, (MergeDataset, ConcatDataset)):
+        return dataset._now if hasattr(type(dataset), "_now") else dataset
+    before = last.datasets if type(last) is type(dataset) else [None] * len(dataset.datasets)
+    parts = [_at_this_moment(part, known) for part, known in zip(dataset.datasets, before, strict=True)]
+    for known in (dataset, last):
+        if known is not None and all(a is b for a, b in zip(parts, known.datasets, strict=True)):
+            return known
+    content = copy.copy(dataset)
+    content.datasets = parts
+    return content
+
+
 class _GoalClips(NamedTuple):
     """The clips of a :class:`GoalDataset`."""
 
@@ -700,8 +726,8 @@ class GoalDataset:
 
     def _clips(self) -> _GoalClips:
         """The clips that have a goal; of a replay buffer, those of its content at this moment."""
-        content = self.dataset._now if hasattr(type(self.dataset), "_now") else self.dataset
         found = self._found
+        content = _at_this_moment(self.dataset, None if found is None else found.content)
         if found is None or found.content is not content:
             lengths = np.asarray(content.lengths)
             clips = np.asarray(content.clip_indices, dtype=np.int64).reshape(-1, 2)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from .. import _files
+
 __all__ = ["Options", "parsed"]
 
 #: The most threads of the engine.
@@ -53,6 +55,8 @@ class Options:
             raise ValueError("data: the name of the dataset is empty; name one with data=PATH")
         if self.out == "":
             raise ValueError("out: the name of the checkpoint is empty; leave it out, or name one with out=PATH")
+        if self.out is not None:
+            _files.local("out", self.out)
         if not 0 <= self.threads <= _MOST_THREADS:
             raise ValueError(f"threads: {self.threads}; expected 0 to {_MOST_THREADS}")
         if not 0 <= self.workers <= _MOST_WORKERS:

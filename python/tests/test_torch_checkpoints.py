@@ -77,7 +77,7 @@ def test_models_are_saved_and_loaded(home):
         load_pretrained("nothing")
 
 
-def test_weights_with_the_configuration_of_others_are_loaded_with_a_warning(home):
+def test_weights_beside_another_configuration_are_loaded_with_a_warning(home):
     def config(name):
         return {"_target_": "torch.nn.Sequential", "_args_": [{"_target_": f"torch.nn.{name}"}]}
 

@@ -384,3 +384,16 @@ def test_threads_that_share_a_solver_get_numbers_of_their_own():
     with ThreadPoolExecutor(4) as threads:
         plans = list(threads.map(lambda _: solver.solve(infos())["actions"].numpy().tobytes(), range(40)))
     assert len(set(plans)) == 40
+
+
+def test_complex_costs_of_a_model_with_complex_parameters_are_refused():
+    class Complex(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.ones(1, dtype=torch.complex64))
+
+        def get_cost(self, info_dict, action_candidates):
+            return (action_candidates * self.weight).sum((2, 3))
+
+    with pytest.raises(ValueError, match="expected real costs, got torch.complex64"):
+        configured(planning.CEMSolver(Complex(), num_samples=8, n_steps=2, topk=3)).solve(infos())

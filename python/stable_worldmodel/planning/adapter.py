@@ -265,7 +265,7 @@ class Adapter:
             got = tuple(cost.shape) if hasattr(cost, "shape") else type(cost).__name__
             name, expected = type(self.model).__name__, tuple(expected)
             raise CostError(f"{name}.get_cost: expected costs of shape {expected} (environments, candidates), got {got}")
-        if cost.dtype != self.dtype:
+        if not (self._as_engine and cost.dtype == self.dtype):
             self._check_real(cost)
         return cost if not isinstance(cost, np.ndarray) else _torch().from_numpy(cost)
 

@@ -176,9 +176,9 @@ def load_pretrained(
         raise FileNotFoundError(f"{settings}: there is no such file, which must describe the model; expected a regular file")
     # Another process may replace both files.
     with _files.locked(file.parent, exclusive=False):
-        config, weights = _read_settings(settings), read_state_dict(file)
-        mark = _mark(file)
-        if mark is not None and mark.get("config") != _hash(settings.read_bytes()):
+        text, weights, mark = _read_settings(settings), read_state_dict(file), _mark(file)
+        config = json.loads(text)
+        if mark is not None and mark.get("config") != _hash(text):
             saved = "without a configuration" if mark.get("config") is None else "with another configuration"
             warnings.warn(f"{file} was saved {saved}; {settings} may describe another model", stacklevel=2)
     for key, value in (extra_args or {}).items():
@@ -194,13 +194,13 @@ def load_pretrained(
     return model
 
 
-def _read_settings(path: Path) -> Any:
-    """The configuration in a file, which is no larger than one that a person or `save_pretrained` writes."""
+def _read_settings(path: Path) -> bytes:
+    """The text of a configuration, which is no larger than one that a person or `save_pretrained` writes."""
     with path.open("rb") as file:
         text = file.read(_MOST_SETTINGS + 1)
     if len(text) > _MOST_SETTINGS:
         raise ValueError(f"{path}: it has more than {_MOST_SETTINGS} bytes; expected the configuration of a model")
-    return json.loads(text)
+    return text
 
 
 def _built(config: Any, stored_bytes: int, stored_tensors: int) -> Any:

@@ -6,6 +6,10 @@
 //! gave other weights on another processor. Here sums of more than 512 products are cut into equal blocks of at most 512 first, which
 //! the original's kernels (`gemm-f32` and its siblings) compute as one on every machine. Nothing else of a kernel's
 //! result depends on the caches.
+//!
+//! Of single precision, products are computed with AVX-512 where the processor has it, in tiles whose elements are summed one by one
+//! like those of AVX2. Products of rows with columns are the exception: their sums are over the lanes of a vector, so that they
+//! are computed with AVX2 everywhere.
 
 #![allow(unsafe_code, reason = "products are computed on pointers, as Burn gives them")]
 
@@ -56,11 +60,22 @@ impl<T> Product<T> {
         Self { sides: [n, m, k], dst: self.dst.transposed(), lhs: self.rhs.transposed(), rhs: self.lhs.transposed() }
     }
 
+    /// Whether neighbouring terms of a sum are neighbours in memory, in both matrices.
+    fn is_of_rows_and_columns(&self) -> bool {
+        self.lhs.to_next_column == 1 && self.rhs.to_next_row == 1
+    }
+
+    /// Whether the kernels sum the lanes of vectors, whose number then decides how sums are rounded.
+    fn has_sums_over_lanes(&self) -> bool {
+        let [m, n, _] = self.sides;
+        self.is_of_rows_and_columns() && (m * n <= DOTS || m.min(n) <= 1)
+    }
+
     /// Returns the lengths of the blocks into which sums are cut here; the last may be shorter.
     fn block(&self) -> usize {
         let [m, n, k] = self.sides;
         let (lhs, rhs, dst) = (&self.lhs, &self.rhs, &self.dst);
-        let of_rows_and_columns = lhs.to_next_column == 1 && rhs.to_next_row == 1;
+        let of_rows_and_columns = self.is_of_rows_and_columns();
         let by_columns = n <= 1 && lhs.to_next_row == 1 && dst.to_next_row == 1;
         let by_rows = m <= 1 && rhs.to_next_column == 1 && dst.to_next_column == 1;
         let is_vector = by_columns || by_rows || (m.min(n) <= 1 && of_rows_and_columns);
@@ -102,18 +117,108 @@ type Kernel<T> = unsafe fn(
     Parallelism,
 );
 
+/// The kernels of single precision on x86, by the instructions that they use. Whatever the width of its vectors, a kernel computes
+/// an element of the result as one sum in the order of its terms, except in products of rows with columns.
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+mod single {
+    use super::{Kernel, Parallelism};
+    use gemm_common::gemm::gemm_basic_generic;
+    use gemm_common::simd::{V3, V4};
+    use gemm_f32::microkernel;
+
+    macro_rules! kernel {
+        ($name:ident, $simd:ty, $lanes:literal) => {
+            /// A kernel: as [`gemm()`](super::gemm()).
+            #[allow(clippy::too_many_arguments, clippy::fn_params_excessive_bools, reason = "the type of kernels")]
+            pub unsafe fn $name(
+                m: usize,
+                n: usize,
+                k: usize,
+                dst: *mut f32,
+                dst_cs: isize,
+                dst_rs: isize,
+                read_dst: bool,
+                lhs: *const f32,
+                lhs_cs: isize,
+                lhs_rs: isize,
+                rhs: *const f32,
+                rhs_cs: isize,
+                rhs_rs: isize,
+                alpha: f32,
+                beta: f32,
+                conj_dst: bool,
+                conj_lhs: bool,
+                conj_rhs: bool,
+                parallelism: Parallelism,
+            ) {
+                use microkernel::$name::f32::{H_M, H_N, H_UKR, MR_DIV_N, NR, UKR};
+                let simd = <$simd>::try_new().expect("the processor has the instructions of the chosen kernel");
+                // SAFETY: the caller vouches for the matrices, and `try_new` for the instructions.
+                unsafe {
+                    gemm_basic_generic::<_, f32, $lanes, { MR_DIV_N * $lanes }, NR, MR_DIV_N, H_M, H_N>(
+                        simd,
+                        m,
+                        n,
+                        k,
+                        dst,
+                        dst_cs,
+                        dst_rs,
+                        read_dst,
+                        lhs,
+                        lhs_cs,
+                        lhs_rs,
+                        rhs,
+                        rhs_cs,
+                        rhs_rs,
+                        alpha,
+                        beta,
+                        conj_dst,
+                        conj_lhs,
+                        conj_rhs,
+                        |a, b, c| a * b + c,
+                        &UKR,
+                        &H_UKR,
+                        false,
+                        parallelism,
+                    );
+                }
+            }
+        };
+    }
+    kernel!(fma, V3, 8);
+    kernel!(avx512f, V4, 16);
+
+    /// Returns the kernel of the widest vectors that a product may be computed with.
+    pub fn kernel(has_sums_over_lanes: bool) -> Kernel<f32> {
+        match (V3::try_new(), V4::try_new()) {
+            (_, Some(_)) if !has_sums_over_lanes => avx512f,
+            (Some(_), _) => fma,
+            _ => gemm_f32::gemm::f32::get_gemm_fn(),
+        }
+    }
+}
+
+/// The kernels of single precision of other processors.
+#[cfg(not(any(target_arch = "x86", target_arch = "x86_64")))]
+mod single {
+    /// Returns the kernel of the processor.
+    pub fn kernel(_has_sums_over_lanes: bool) -> super::Kernel<f32> {
+        gemm_f32::gemm::f32::get_gemm_fn()
+    }
+}
+
 /// Computes a product block by block. `alpha` is the factor of the destination, none if it is not read; `one` is 1.
 ///
 /// # Safety
 /// As for [`gemm()`].
 unsafe fn in_blocks<T: Copy>(
-    kernel: Kernel<T>,
+    kernel: impl Fn(&Product<T>) -> Kernel<T>,
     product: Product<T>,
     (alpha, beta, one): (Option<T>, T, T),
     parallelism: Parallelism,
 ) {
     let product = product.oriented();
-    let block = product.block();
+    let (kernel, block) = (kernel(&product), product.block());
     let Product { sides: [m, n, k], dst, lhs, rhs } = product;
     let (mut done, mut factor) = (0, alpha);
     loop {
@@ -198,14 +303,15 @@ pub unsafe fn gemm<T: 'static>(
     unsafe {
         if TypeId::of::<T>() == TypeId::of::<f32>() {
             let factors = (read_dst.then_some(*alpha.cast()), *beta.cast(), 1.0);
-            in_blocks(gemm_f32::gemm::f32::get_gemm_fn(), product.cast(), factors, parallelism);
+            let kernel = |product: &Product<f32>| single::kernel(product.has_sums_over_lanes());
+            in_blocks(kernel, product.cast(), factors, parallelism);
         } else if TypeId::of::<T>() == TypeId::of::<f64>() {
             let factors = (read_dst.then_some(*alpha.cast()), *beta.cast(), 1.0);
-            in_blocks(gemm_f64::gemm::f64::get_gemm_fn(), product.cast(), factors, parallelism);
+            in_blocks(|_| gemm_f64::gemm::f64::get_gemm_fn(), product.cast(), factors, parallelism);
         } else {
             assert!(TypeId::of::<T>() == TypeId::of::<gemm_f16::f16>(), "products of this type are not computed here");
             let factors = (read_dst.then_some(*alpha.cast()), *beta.cast(), gemm_f16::f16::ONE);
-            in_blocks(gemm_f16::gemm::f16::get_gemm_fn(), product.cast(), factors, parallelism);
+            in_blocks(|_| gemm_f16::gemm::f16::get_gemm_fn(), product.cast(), factors, parallelism);
         }
     }
 }
@@ -296,6 +402,45 @@ mod tests {
     #[cfg(not(any(target_arch = "x86", target_arch = "x86_64")))]
     fn has_fma() -> bool {
         false
+    }
+
+    /// Products of every orientation, with small and large sides and with long sums, that are added to what is there.
+    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+    #[test]
+    fn vectors_of_both_widths_give_the_same_bits() {
+        if !(has_fma() && std::arch::is_x86_feature_detected!("avx512f")) {
+            return;
+        }
+        for m in [1, 7, 16, 33, 64, 130] {
+            for n in [1, 5, 6, 17, 65] {
+                for k in [1, 2, 3, 24, 129, 700] {
+                    for layouts in 0..8 {
+                        let (lhs, rhs) = (values(m * k, 1), values(k * n, 5));
+                        let [with_avx512, with_avx2] = [None, Some(single::fma as Kernel<f32>)].map(|kernel| {
+                            let mut out = values(m * n, 3);
+                            // The strides to the next column and row: row-major or column-major.
+                            let strides = |bit: usize, rows: usize, columns: usize| {
+                                if layouts >> bit & 1 == 0 { (1, columns as isize) } else { (rows as isize, 1) }
+                            };
+                            let [dst, l, r] = [strides(0, m, n), strides(1, m, k), strides(2, k, n)];
+                            let product = Product {
+                                sides: [m, n, k],
+                                dst: Matrix::new(out.as_mut_ptr(), dst.0, dst.1),
+                                lhs: Matrix::new(lhs.as_ptr(), l.0, l.1),
+                                rhs: Matrix::new(rhs.as_ptr(), r.0, r.1),
+                            };
+                            let choose = |product: &Product<f32>| {
+                                kernel.unwrap_or_else(|| single::kernel(product.has_sums_over_lanes()))
+                            };
+                            // SAFETY: the matrices have the stated sizes.
+                            unsafe { in_blocks(choose, product, (Some(0.5), 2.0, 1.0), Parallelism::None) };
+                            out
+                        });
+                        assert!(with_avx512 == with_avx2, "{m} x {k} x {n}, layouts {layouts}");
+                    }
+                }
+            }
+        }
     }
 
     #[test]

@@ -36,6 +36,18 @@ unsafe impl GlobalAlloc for Allocator {
     }
 }
 
+/// Makes the system's allocator keep freed memory for later requests. It would return what a training step frees to the system, and get
+/// it back page by page in the next step, which takes a tenth of the time of SAC's and TD-MPC2's steps.
+pub fn keep_freed_memory() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    #[allow(unsafe_code, reason = "the settings of the allocator are a function of the C library")]
+    // SAFETY: the function takes any numbers, and no other thread runs yet.
+    unsafe {
+        libc::mallopt(libc::M_TRIM_THRESHOLD, 256 << 20);
+        libc::mallopt(libc::M_MMAP_THRESHOLD, 32 << 20);
+    }
+}
+
 /// Returns allocated memory; ends the program if there is none and the request is small.
 #[inline]
 fn checked(memory: *mut u8, size: usize) -> *mut u8 {

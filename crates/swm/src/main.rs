@@ -17,6 +17,7 @@ fn main() -> std::process::ExitCode {
         std::io::stderr().write_all(error).ok();
         return std::process::ExitCode::FAILURE;
     }
+    allocator::keep_freed_memory();
     let run = || swm::cli::run(std::env::args_os());
     if main_stack() >= STACK as u64 {
         return run().into();

@@ -59,7 +59,8 @@ impl Reproduction {
 
 impl fmt::Display for Difference {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: was {}, is {}", self.what, self.was, self.is)
+        // Texts of results may have line feeds.
+        write!(f, "{}", format!("{}: was {}, is {}", self.what, self.was, self.is).replace('\n', "\\n"))
     }
 }
 

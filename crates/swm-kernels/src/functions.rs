@@ -62,6 +62,57 @@ pub fn silu(x: &mut [f32]) {
     dispatch(Silu(x));
 }
 
+/// Replaces every element by its Mish (Misra 2019), `x tanh(ln(1 + exp x))`.
+pub fn mish(x: &mut [f32]) {
+    struct Mish<'a>(&'a mut [f32]);
+    impl Kernel for Mish<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Level>(self) {
+            for x in self.0 {
+                let (tanh, _) = tanh_softplus::<L>(*x);
+                *x *= tanh;
+            }
+        }
+    }
+    dispatch(Mish(x));
+}
+
+/// Computes the tangent of [`mish`] at every element: replaces `x` by the value of the tangent line at 0, and writes the slope
+/// of the line to `slopes`. For `t = tanh(ln(1 + exp x))` and the logistic function `σ`, the slope is `t + x σ(x) (1 - t²)`.
+///
+/// # Shapes
+/// `x` and `slopes` have the same length.
+pub fn mish_tangent(x: &mut [f32], slopes: &mut [f32]) {
+    struct Tangent<'a>(&'a mut [f32], &'a mut [f32]);
+    impl Kernel for Tangent<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Level>(self) {
+            for (x, slope) in self.0.iter_mut().zip(self.1) {
+                let (tanh, logistic) = tanh_softplus::<L>(*x);
+                let rest = *x * logistic * (1.0 - tanh * tanh);
+                *slope = tanh + rest;
+                *x *= -rest;
+            }
+        }
+    }
+    dispatch(Tangent(x, slopes));
+}
+
+/// Returns `tanh(ln(1 + exp x))` and `1 / (1 + exp(-x))`.
+#[inline(always)]
+pub(crate) fn tanh_softplus<L: Level>(x: f32) -> (f32, f32) {
+    // With e = exp(-|x|), which is at most 1: (1 + 2 e) / (1 + 2 e + 2 e²) above 0, e (e + 2) / (e (e + 2) + 2) below.
+    let e = exp::<L>(-x.abs());
+    let is_negative = x < 0.0;
+    let numerator = if is_negative { e * (e + 2.0) } else { 1.0 + 2.0 * e };
+    let rest = if is_negative { 2.0 } else { 2.0 * e * e };
+    (numerator / (numerator + rest), if is_negative { e } else { 1.0 } / (1.0 + e))
+}
+
 /// Returns `Φ(x) - 1/2`, half the error function of `x / √2`, by a fitted rational function with an error of at most
 /// 2e-7.
 #[inline(always)]
@@ -240,7 +291,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exp_silu_gelu_softmax_and_sum_match_their_definitions() {
+    fn exp_silu_mish_gelu_softmax_and_sum_match_their_definitions() {
         struct Exp(f32);
         impl Kernel for Exp {
             type Output = f32;
@@ -259,6 +310,16 @@ mod tests {
             let mut values = [x];
             silu(&mut values);
             assert!((values[0] - x / (1.0 + (-x).exp())).abs() < 2e-6, "silu({x})");
+            let double = f64::from(x);
+            let (tanh, logistic) = (double.exp().ln_1p().tanh(), 1.0 / (1.0 + (-double).exp()));
+            let slope = tanh + double * logistic * (1.0 - tanh * tanh);
+            let (mut value, mut offset, mut found) = ([x], [x], [0.0]);
+            mish(&mut value);
+            mish_tangent(&mut offset, &mut found);
+            assert!((f64::from(value[0]) - double * tanh).abs() < 1e-6 * (1.0 + double.abs()), "mish({x})");
+            assert!((f64::from(found[0]) - slope).abs() < 1e-6, "slope of mish at {x}: {}, not {slope}", found[0]);
+            let expected = double * (tanh - slope);
+            assert!((f64::from(offset[0]) - expected).abs() < 2e-6 * (1.0 + double.abs()), "offset of mish at {x}");
         }
         // Φ is integrated from 0 by Simpson's rule; the density is smooth enough for 2,000 intervals.
         let density = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();

@@ -1,4 +1,4 @@
-//! CPU kernels for planning and for training image encoders, on plain row-major `f32` slices.
+//! CPU kernels for planning and for training image encoders and hidden layers, on plain row-major `f32` slices.
 //!
 //! A tensor library allocates and reads memory once per operation. Here weights are laid out once ([`Panels`]), scratch
 //! memory is reused ([`ScratchPool`]), and every row is computed independently, so no byte of a result depends on the
@@ -14,7 +14,9 @@ mod colour_moments;
 mod conv;
 pub mod functions;
 mod keypoints;
+mod matrix;
 mod norm;
+mod norm_mish;
 mod panels;
 mod product;
 mod scratch;
@@ -27,7 +29,9 @@ pub use attention::causal_attention;
 pub use colour_moments::{ColourMoments, ColourScratch};
 pub use conv::{ChannelStatistics, ConvEncoder, ConvGradient, ConvParameters, ConvSizes, ConvStage};
 pub use keypoints::{FilterBank, KeypointScratch, Keypoints};
+pub use matrix::{Matrix, multiply};
 pub use norm::{Modulation, Norm, add_gated};
+pub use norm_mish::{NormMish, NormMishTape};
 pub use panels::Panels;
 pub use scratch::{ScratchPool, grown};
 pub use vit::{VitEncoder, VitLayerParameters, VitParameters};

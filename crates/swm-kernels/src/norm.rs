@@ -86,7 +86,7 @@ impl Kernel for Normalise<'_> {
 
 /// Subtracts the mean and returns the factor `1 / sqrt(variance + epsilon)`.
 #[inline(always)]
-fn center<L: Level>(row: &mut [f32], epsilon: f32) -> f32 {
+pub(crate) fn center<L: Level>(row: &mut [f32], epsilon: f32) -> f32 {
     let n = row.len() as f32;
     let mean = sum(row) / n;
     for x in row.iter_mut() {

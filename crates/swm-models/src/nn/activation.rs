@@ -39,25 +39,36 @@ impl Activation {
 /// `x Φ(x)`. The CPU uses the vectorised kernel of `swm-kernels`: Burn computes the error function one element at a
 /// time, and twice in training.
 fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
-    let device = x.device();
-    if !is_cpu(&device) && device.is_autodiff() {
-        return differentiable_gelu(x);
+    if has_kernels(&x) {
+        return with_kernels(x, functions::gelu, functions::gelu_tangent);
     }
-    if !is_cpu(&device) || x.dtype() != DType::F32 {
-        return activation::gelu(x);
-    }
-    let shape = x.dims();
+    if !is_cpu(&x.device()) && x.is_autodiff() { differentiable_gelu(x) } else { activation::gelu(x) }
+}
+
+/// Whether the CPU kernels of `swm-kernels` apply to a tensor.
+pub(super) fn has_kernels<const D: usize>(x: &Tensor<D>) -> bool {
+    is_cpu(&x.device()) && x.dtype() == DType::F32
+}
+
+/// Applies an elementwise function of `swm-kernels` on the CPU. `tangent` replaces elements by the values at 0 of the function's
+/// tangents, and writes the slopes of the tangents.
+pub(super) fn with_kernels<const D: usize>(
+    x: Tensor<D>,
+    function: fn(&mut [f32]),
+    tangent: fn(&mut [f32], &mut [f32]),
+) -> Tensor<D> {
+    let (shape, device) = (x.dims(), x.device());
     let tensor = |values: Vec<f32>| Tensor::<D>::from_data(TensorData::new(values, shape), &device);
-    if !device.is_autodiff() {
+    if !x.is_autodiff() {
         let mut values = host(x);
-        functions::gelu(&mut values);
+        function(&mut values);
         return tensor(values);
     }
     // The tangent at an element has the function's value and derivative at that element, so the backward pass through
     // the tangent is exact.
     let mut offsets = host(x.clone().inner());
     let mut slopes = vec![0.0; offsets.len()];
-    functions::gelu_tangent(&mut offsets, &mut slopes);
+    tangent(&mut offsets, &mut slopes);
     x * tensor(slopes) + tensor(offsets)
 }
 
@@ -87,13 +98,18 @@ impl DropoutRng<'_> {
     /// # Shapes
     /// Maps `[…]` to the same shape.
     pub fn dropout<const D: usize>(&mut self, x: Tensor<D>, rate: f32) -> Tensor<D> {
-        let Some(rng) = self.0.as_deref_mut().filter(|_| rate > 0.0) else { return x };
+        let (shape, device) = (x.dims(), x.device());
+        match self.mask(shape.iter().product(), rate) {
+            Some(mask) => x * Tensor::from_data(TensorData::new(mask, shape), &device),
+            None => x,
+        }
+    }
+
+    /// Draws the factors of [`DropoutRng::dropout`] for `count` elements; `None` if it changes nothing.
+    pub(super) fn mask(&mut self, count: usize, rate: f32) -> Option<Vec<f32>> {
+        let rng = self.0.as_deref_mut().filter(|_| rate > 0.0)?;
         let scale = 1.0 / (1.0 - rate);
-        let shape = x.dims();
-        let mask: Vec<f32> =
-            (0..shape.iter().product()).map(|_| if rng.random::<f32>() < rate { 0.0 } else { scale }).collect();
-        let mask = Tensor::from_data(TensorData::new(mask, shape), &x.device());
-        x * mask
+        Some((0..count).map(|_| if rng.random::<f32>() < rate { 0.0 } else { scale }).collect())
     }
 }
 

@@ -1,9 +1,12 @@
 //! A linear layer in PyTorch's layout.
 
 use super::Init;
+use super::activation::has_kernels;
+use super::fused_layers;
 use crate::device::matmul;
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
+use burn::tensor::activation::relu;
 
 /// A linear layer, `y = x Wᵀ + b`.
 #[derive(Module, Debug)]
@@ -53,5 +56,28 @@ impl Linear {
             y = y + bias.val().unsqueeze();
         }
         y.reshape(shape)
+    }
+
+    /// Applies the layer as one operation, on the CPU. The last bits of a gradient can be others than those of
+    /// [`Linear::forward`].
+    ///
+    /// # Shapes
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
+    pub fn forward_fused(&self, x: Tensor<2>) -> Tensor<2> {
+        match &self.bias {
+            Some(bias) if has_kernels(&x) => fused_layers::linear(x, self.weight.val(), bias.val(), false),
+            _ => self.forward(x),
+        }
+    }
+
+    /// Applies the layer and ReLU as one operation, on the CPU.
+    ///
+    /// # Shapes
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
+    pub fn forward_fused_relu(&self, x: Tensor<2>) -> Tensor<2> {
+        match &self.bias {
+            Some(bias) if has_kernels(&x) => fused_layers::linear(x, self.weight.val(), bias.val(), true),
+            _ => relu(self.forward(x)),
+        }
     }
 }

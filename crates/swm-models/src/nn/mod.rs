@@ -7,6 +7,7 @@ pub mod backbone;
 pub mod conv;
 mod custom_derivative;
 pub mod dino;
+mod fused_layers;
 pub(crate) mod kernels;
 pub mod keypoints;
 pub mod linear;

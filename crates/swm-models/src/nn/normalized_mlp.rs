@@ -1,10 +1,13 @@
 //! Multi-layer perceptrons with normalised hidden layers (Hansen, Su and Wang 2024, arXiv 2310.16828): every hidden
 //! layer is linear, normalised, and goes through Mish; a latent is a concatenation of simplices.
 
+use super::activation::{has_kernels, with_kernels};
+use super::fused_layers::{self, HiddenParameters};
 use super::norm::standardize;
 use super::{DropoutRng, Init, LayerNorm, Linear, with_derivative};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, activation};
+use swm_kernels::functions;
 
 /// The value that the normalisations add to the variance.
 const EPSILON: f64 = 1e-5;
@@ -38,6 +41,25 @@ impl NormalizedLinear {
     /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         self.ln.forward(x.matmul(self.weight.val().transpose()) + self.bias.val().unsqueeze())
+    }
+
+    /// Computes the output of a hidden layer: [`NormalizedLinear::forward`] and Mish.
+    ///
+    /// # Shapes
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
+    pub fn hidden(&self, x: Tensor<2>) -> Tensor<2> {
+        self.hidden_with_dropout(x, 0.0, &mut DropoutRng::disabled())
+    }
+
+    /// As [`NormalizedLinear::hidden`], with dropout after the matrix product.
+    fn hidden_with_dropout(&self, x: Tensor<2>, rate: f32, noise: &mut DropoutRng<'_>) -> Tensor<2> {
+        let (weight, bias, norm) = (self.weight.val(), self.bias.val(), &self.ln);
+        if has_kernels(&x) {
+            let mask = noise.mask(x.dims()[0] * bias.dims()[0], rate).unwrap_or_default();
+            let (scale, shift, epsilon) = (norm.weight.val(), norm.bias.val(), norm.epsilon());
+            return fused_layers::hidden(x, HiddenParameters { weight, bias, scale, shift, epsilon }, mask);
+        }
+        mish(norm.forward(noise.dropout(x.matmul(weight.transpose()) + bias.unsqueeze(), rate)))
     }
 }
 
@@ -74,7 +96,7 @@ impl Head {
     /// # Shapes
     /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        self._2.forward(mish(self._1.forward(mish(self._0.forward(x)))))
+        self._2.forward_fused(self._1.hidden(self._0.hidden(x)))
     }
 }
 
@@ -104,14 +126,16 @@ impl Dynamics {
     /// # Shapes
     /// Maps `[rows, inputs]` to `[rows, latent]`.
     pub fn forward(&self, x: Tensor<2>, simplex: usize) -> Tensor<2> {
-        let hidden = mish(self._1.forward(mish(self._0.forward(x))));
-        sim_norm(self._2.forward(hidden), simplex)
+        sim_norm(self._2.forward(self._1.hidden(self._0.hidden(x))), simplex)
     }
 }
 
-/// Several heads of equal sizes, computed together: one batched matrix product per layer.
+/// Several heads of equal sizes. A GPU computes them together, with one batched matrix product per layer; the CPU computes one after
+/// another, without copying weights.
 pub struct Ensemble {
-    layers: [Layer; 3],
+    heads: Vec<Head>,
+    /// The layers of all heads; `None` on the CPU.
+    layers: Option<[Layer; 3]>,
 }
 
 /// One layer of all heads: weights `[heads, inputs, outputs]`; bias, scale and shift `[heads, 1, outputs]`.
@@ -124,26 +148,31 @@ struct Layer {
 impl Ensemble {
     /// Combines heads; gradients flow back to the heads.
     pub fn of(heads: &[&Head]) -> Self {
-        let hidden = |get: fn(&Head) -> &NormalizedLinear| Layer {
-            weight: matrices(heads.iter().map(|head| &get(head).weight)),
-            bias: rows(heads.iter().map(|head| Some(&get(head).bias))),
-            norm: rows(heads.iter().map(|head| Some(&get(head).ln.weight)))
-                .zip(rows(heads.iter().map(|head| Some(&get(head).ln.bias))))
-                .map(<[_; 2]>::from),
-        };
-        let last = Layer {
-            weight: matrices(heads.iter().map(|head| &head._2.weight)),
-            bias: rows(heads.iter().map(|head| head._2.bias.as_ref())),
-            norm: None,
-        };
-        Self { layers: [hidden(|head| &head._0), hidden(|head| &head._1), last] }
+        let is_on_cpu = heads.first().is_none_or(|head| has_kernels(&head._2.weight.val()));
+        let layers = (!is_on_cpu).then(|| {
+            let hidden = |get: fn(&Head) -> &NormalizedLinear| Layer {
+                weight: matrices(heads.iter().map(|head| &get(head).weight)),
+                bias: rows(heads.iter().map(|head| Some(&get(head).bias))),
+                norm: rows(heads.iter().map(|head| Some(&get(head).ln.weight)))
+                    .zip(rows(heads.iter().map(|head| Some(&get(head).ln.bias))))
+                    .map(<[_; 2]>::from),
+            };
+            let last = Layer {
+                weight: matrices(heads.iter().map(|head| &head._2.weight)),
+                bias: rows(heads.iter().map(|head| head._2.bias.as_ref())),
+                norm: None,
+            };
+            [hidden(|head| &head._0), hidden(|head| &head._1), last]
+        });
+        Self { heads: heads.iter().map(|head| (*head).clone()).collect(), layers }
     }
 
-    /// Returns the heads as constants of a graph: gradients flow through them to the input, but not to the heads.
+    /// Returns heads that are outside a graph as constants of a graph: gradients flow through them to the input, but not to the heads.
     #[must_use]
     pub fn frozen(mut self) -> Self {
+        self.heads = self.heads.into_iter().map(|head| head.train().no_grad()).collect();
         let freeze = |tensor: &mut Tensor<3>| *tensor = tensor.clone().inner().autodiff();
-        for Layer { weight, bias, norm } in &mut self.layers {
+        for Layer { weight, bias, norm } in self.layers.iter_mut().flatten() {
             freeze(weight);
             bias.iter_mut().chain(norm.iter_mut().flatten()).for_each(freeze);
         }
@@ -155,7 +184,12 @@ impl Ensemble {
     /// # Shapes
     /// Maps `[rows, inputs]` to `[heads, rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>, dropout: f32, noise: &mut DropoutRng<'_>) -> Tensor<3> {
-        let [first, second, last] = &self.layers;
+        let Some([first, second, last]) = &self.layers else {
+            let outputs = self.heads.iter().map(|Head { _0, _1, _2 }| {
+                _2.forward_fused(_1.hidden(_0.hidden_with_dropout(x.clone(), dropout, noise)))
+            });
+            return Tensor::stack(outputs.collect(), 0);
+        };
         let [heads, _, _] = first.weight.dims();
         let [rows, inputs] = x.dims();
         let x = x.unsqueeze_dim::<3>(0).expand([heads, rows, inputs]);
@@ -207,6 +241,9 @@ impl Layer {
 /// # Shapes
 /// Maps `[…]` to the same shape.
 pub fn mish<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    if has_kernels(&x) {
+        return with_kernels(x, functions::mish, functions::mish_tangent);
+    }
     let inner = x.clone().inner();
     // Above 20 the function equals x in single precision; the bound keeps the square of the exponential finite.
     let exponential = inner.clone().clamp_max(20.0).exp();

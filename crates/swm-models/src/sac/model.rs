@@ -1,7 +1,7 @@
 //! [`Sac`]: the networks of a SAC, with the parameter names of Stable-Baselines3.
 
 use super::config::{SacConfig, SacLoss};
-use crate::nn::{Activation, Init, Linear};
+use crate::nn::{Init, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 
@@ -108,9 +108,8 @@ impl Actor {
     /// # Shapes
     /// `observations` is `[rows, inputs]`; returns `[rows, action_dim]` twice.
     pub fn forward(&self, observations: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
-        let relu = |x| Activation::Relu.forward(x);
-        let hidden = relu(self.latent_pi._2.forward(relu(self.latent_pi._0.forward(observations))));
-        (self.mu.forward(hidden.clone()), self.log_std.forward(hidden).clamp(-20.0, 2.0))
+        let hidden = self.latent_pi._2.forward_fused_relu(self.latent_pi._0.forward_fused_relu(observations));
+        (self.mu.forward_fused(hidden.clone()), self.log_std.forward_fused(hidden).clamp(-20.0, 2.0))
     }
 
     /// Samples actions with standard normal `noise`.
@@ -140,7 +139,6 @@ impl Critics {
 
 impl Critic {
     fn forward(&self, x: Tensor<2>) -> Tensor<1> {
-        let relu = |x| Activation::Relu.forward(x);
-        self._4.forward(relu(self._2.forward(relu(self._0.forward(x))))).squeeze_dim(1)
+        self._4.forward_fused(self._2.forward_fused_relu(self._0.forward_fused_relu(x))).squeeze_dim(1)
     }
 }

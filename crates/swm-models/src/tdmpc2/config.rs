@@ -74,7 +74,7 @@ impl Tdmpc2Config {
             ("model.image", self.image, 0, limits::SIDE),
             ("model.encoder", self.encoder, 1, limits::FEATURES),
             ("model.hidden", self.hidden, 1, limits::FEATURES),
-            ("model.simplex", self.simplex, 1, limits::FEATURES),
+            ("model.simplex", self.simplex, 2, limits::FEATURES),
             ("model.bins.count", self.bins.count, 2, limits::FEATURES),
             ("model.critics", self.critics, 2, limits::LAYERS),
         ])?;

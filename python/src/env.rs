@@ -3,6 +3,7 @@
 use crate::arrays;
 use crate::data::process;
 use crate::errors::to_py_err;
+use crate::exit;
 use crate::snapshots;
 use crate::world::{factors, reset_options, stack};
 use numpy::PyReadonlyArray1;
@@ -45,7 +46,7 @@ impl NativeEnv {
     #[new]
     fn new(py: Python<'_>, id: &str, wrappers: &str, wrap_goal: bool) -> PyResult<Self> {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
-        let made = py.detach(|| {
+        let made = exit::detached(py, || {
             let env = stack.wrap(swm::env(id, &Origin::User)?.env()?, goal);
             let row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
             Ok(State { env, row })
@@ -63,7 +64,7 @@ impl NativeEnv {
         let options = reset_options(options)?;
         let mut state = self.lock();
         let state = &mut *state;
-        py.detach(|| state.env.reset(seed, &options)).map_err(to_py_err)?;
+        exit::detached(py, || state.env.reset(seed, &options)).map_err(to_py_err)?;
         state.observe(py)
     }
 
@@ -79,10 +80,10 @@ impl NativeEnv {
         let state = &mut *state;
         let stepped = if let Ok(values) = action.extract::<PyReadonlyArray1<'_, f32>>() {
             let values = values.as_slice()?;
-            py.detach(|| state.env.step(Action::Continuous(values)))
+            exit::detached(py, || state.env.step(Action::Continuous(values)))
         } else if let Ok(integers) = action.extract::<PyReadonlyArray1<'_, i64>>() {
             let integers = integers.as_slice()?;
-            py.detach(|| state.env.step(Action::Discrete(integers)))
+            exit::detached(py, || state.env.step(Action::Discrete(integers)))
         } else {
             return Err(PyTypeError::new_err(format!(
                 "step: expected a float32 or int64 array as action, got {action:?}"

@@ -1,5 +1,6 @@
 //! Conversion between engine errors and Python exceptions; Python's signals and progress in the engine's loops.
 
+use crate::exit::is_over;
 use pyo3::exceptions::{PyFileNotFoundError, PyKeyboardInterrupt, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -37,6 +38,9 @@ pub fn from_py_err(error: PyErr) -> Error {
 /// Runs `work` in Python, for a thread of the engine. While the interpreter shuts down, there is nothing to call, and the thread is told
 /// to stop.
 pub fn attached<T>(work: impl FnOnce(Python<'_>) -> PyResult<T>) -> swm::core::Result<T> {
+    if is_over() {
+        return Err(Error::Interrupted);
+    }
     Python::try_attach(work).map_or(Err(Error::Interrupted), |outcome| outcome.map_err(from_py_err))
 }
 
@@ -45,6 +49,9 @@ pub fn attached<T>(work: impl FnOnce(Python<'_>) -> PyResult<T>) -> swm::core::R
 pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
     let mut last = Instant::now();
     move || {
+        if is_over() {
+            return Err(Error::Interrupted);
+        }
         if last.elapsed() < Duration::from_millis(20) {
             return Ok(());
         }

@@ -2,6 +2,7 @@
 
 use crate::arrays;
 use crate::errors::{json, to_py_err};
+use crate::exit;
 use numpy::{PyReadonlyArray3, PyReadonlyArray4, PyUntypedArrayMethods as _};
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
@@ -69,6 +70,6 @@ pub fn write_video(py: Python<'_>, path: PathBuf, frames: PyReadonlyArray4<'_, u
         return Err(to_py_err(Error::config("frames", problem, "give frames (count, height, width, 3)")));
     }
     let rgb = frames.as_slice()?;
-    py.detach(|| swm::data::write_mp4(&path, width, height, fps, rgb.chunks_exact(height * width * 3)))
+    exit::detached(py, || swm::data::write_mp4(&path, width, height, fps, rgb.chunks_exact(height * width * 3)))
         .map_err(to_py_err)
 }

@@ -1,9 +1,11 @@
 //! [`InProcess`]: Gymnasium environments in this interpreter, through the bridge that worker processes also use.
 
 use crate::errors::from_py_err;
+use crate::exit::{self, is_over};
 use pyo3::prelude::*;
 use pyo3::types::{PyByteArray, PyBytes, PyModule};
 use std::cell::Cell;
+use swm::core::Error;
 use swm::gym::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport};
 
 /// A [`Transport`] to an environment in this interpreter.
@@ -12,7 +14,7 @@ pub struct InProcess {
     make: Py<PyAny>,
     bridge: Option<Py<PyAny>>,
     /// The memory that the bridge reads and writes. The bridge's memory views prevent a resize.
-    memory: Option<Py<PyByteArray>>,
+    memory: Option<Memory>,
 }
 
 impl InProcess {
@@ -49,9 +51,23 @@ impl Drop for Call {
     }
 }
 
+/// The memory of a byte array, which the engine reads and writes without the GIL.
+struct Memory {
+    /// The address of the first byte.
+    address: usize,
+    size: usize,
+    _owner: Py<PyByteArray>,
+}
+
 /// Converts a Python exception to a failure that is not retried, because a retry would raise the exception again.
 fn refused(error: PyErr) -> Failure {
     Failure::Refused(from_py_err(error))
+}
+
+/// Runs `work` in Python, unless the interpreter ends.
+fn in_python<T>(work: impl FnOnce(Python<'_>) -> Result<T, Failure>) -> Result<T, Failure> {
+    let ended = || Err(Failure::Refused(Error::Interrupted));
+    if is_over() { ended() } else { Python::try_attach(work).unwrap_or_else(ended) }
 }
 
 impl Transport for InProcess {
@@ -61,20 +77,21 @@ impl Transport for InProcess {
     }
 
     fn describe(&mut self) -> Result<Description, Failure> {
-        Python::attach(|py| {
+        in_python(|py| {
             let bridge = self.make.bind(py).call0().map_err(refused)?;
             let text: String = bridge.call_method0("describe").and_then(|text| text.extract()).map_err(refused)?;
             let description = Description::parse(&text).map_err(Failure::Refused)?;
             let memory = PyByteArray::new(py, &vec![0; description.size]);
             bridge.call_method1("attach", (&memory,)).map_err(refused)?;
             self.bridge = Some(bridge.unbind());
-            self.memory = Some(memory.unbind());
+            let address = memory.data().expose_provenance();
+            self.memory = Some(Memory { address, size: memory.len(), _owner: memory.unbind() });
             Ok(description)
         })
     }
 
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure> {
-        Python::attach(|py| {
+        in_python(|py| {
             let Some(bridge) = &self.bridge else {
                 return Err(Failure::Lost("the environment was not described yet".to_owned()));
             };
@@ -85,24 +102,22 @@ impl Transport for InProcess {
     }
 
     fn memory(&self) -> &[u8] {
-        let Some(memory) = &self.memory else { return &[] };
+        let Some(Memory { address, size, .. }) = &self.memory else { return &[] };
         // SAFETY: only this object and the bridge hold the byte array, and the bridge's memory views prevent a resize.
         // The bridge writes only during `call`, which borrows `self` exclusively.
         #[allow(unsafe_code, reason = "the bridge shares its memory with the engine")]
-        Python::attach(|py| unsafe {
-            let memory = memory.bind(py);
-            std::slice::from_raw_parts(memory.data(), memory.len())
-        })
+        unsafe {
+            std::slice::from_raw_parts(std::ptr::with_exposed_provenance(*address), *size)
+        }
     }
 
     fn memory_mut(&mut self) -> &mut [u8] {
-        let Some(memory) = &self.memory else { return &mut [] };
+        let Some(Memory { address, size, .. }) = &self.memory else { return &mut [] };
         // SAFETY: as in `memory`; `self` is borrowed exclusively.
         #[allow(unsafe_code, reason = "the bridge shares its memory with the engine")]
-        Python::attach(|py| unsafe {
-            let memory = memory.bind(py);
-            std::slice::from_raw_parts_mut(memory.data(), memory.len())
-        })
+        unsafe {
+            std::slice::from_raw_parts_mut(std::ptr::with_exposed_provenance_mut(*address), *size)
+        }
     }
 }
 
@@ -110,6 +125,7 @@ impl Transport for InProcess {
 /// `swm_craftax`, which needs JAX.
 #[pyfunction]
 pub fn bridge(py: Python<'_>, craftax: bool) -> PyResult<Bound<'_, PyModule>> {
+    let _call = exit::Call::begin();
     let modules = py.import("sys")?.getattr("modules")?;
     let load = |source: &str, name: &str| -> PyResult<Bound<'_, PyModule>> {
         if let Ok(known) = modules.get_item(name) {

@@ -2,6 +2,7 @@
 //! package `stable_worldmodel`; this module is private to it.
 //!
 //! - [`errors`]: engine errors as Python exceptions, and signal handling.
+//! - [`exit`]: the end of the interpreter.
 //! - [`arrays`]: batches as numpy arrays, and back.
 //! - [`world`], [`policy`]: batches of environments and the policies that act in them.
 //! - [`cost`], [`solver`], [`model`]: models implemented in Python, planning, and the engine's checkpoints.
@@ -18,6 +19,7 @@ mod cost;
 mod data;
 mod env;
 mod errors;
+mod exit;
 mod frames;
 mod gym;
 mod listing;
@@ -74,7 +76,10 @@ mod _engine {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        let _call = exit::Call::begin();
         data::process::record_process();
+        let at_exit = wrap_pyfunction!(exit::end_calls, module)?;
+        module.py().import("atexit")?.call_method1("register", (at_exit,))?;
         let finder = module.py().import("stable_worldmodel._zoo")?;
         if let Some(folder) = finder.getattr("data_wheel")?.call0()?.extract::<Option<PathBuf>>()? {
             swm::zoo::set_data_wheel(folder);

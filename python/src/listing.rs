@@ -1,6 +1,7 @@
 //! The engine's registries as JSON, and the command line.
 
 use crate::errors::to_py_err;
+use crate::exit;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 
@@ -13,7 +14,7 @@ pub fn envs() -> Vec<&'static str> {
 /// The description of an environment, as JSON: spaces, info columns, factors, options, experts.
 #[pyfunction]
 pub fn spec(py: Python<'_>, id: &str) -> PyResult<String> {
-    let described = py.detach(|| {
+    let described = exit::detached(py, || {
         let chosen = swm::env(id, &swm::core::Origin::User)?;
         let env = chosen.env()?;
         Ok(swm::describe::env(&chosen.entry, env.spec()).to_string())

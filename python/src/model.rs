@@ -2,6 +2,7 @@
 
 use crate::arrays;
 use crate::errors::{json, to_py_err};
+use crate::exit;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::{Value, json};
@@ -59,13 +60,12 @@ impl Model {
     fn new(py: Python<'_>, name: &str, device: &str, objective: &str, trust: bool) -> PyResult<Self> {
         let device = swm::models::device::parse(device).map_err(to_py_err)?;
         let objective: Value = json("objective", objective)?;
-        let (path, info) = py
-            .detach(|| {
-                let path = swm::home::find_checkpoint(name)?;
-                let info = load(&path, &device)?.info()?;
-                Ok((path, info))
-            })
-            .map_err(to_py_err)?;
+        let found = exit::detached(py, || {
+            let path = swm::home::find_checkpoint(name)?;
+            let info = load(&path, &device)?.info()?;
+            Ok((path, info))
+        });
+        let (path, info) = found.map_err(to_py_err)?;
         let CheckpointInfo { family, weights, config, dataset_info, image_size, action_block, history, .. } = &info;
         let described = json!({
             "family": family,
@@ -113,7 +113,7 @@ impl Model {
         let rows = batch.rows();
         let mut policy = self.policy.lock().unwrap_or_else(PoisonError::into_inner);
         let cached = &mut *policy;
-        let actions = py.detach(|| {
+        let actions = exit::detached(py, || {
             let what = || format!("checkpoint {}", self.path.display());
             let Some(id) = &self.env else {
                 return Err(Error::config(what(), "its manifest does not name an environment", "train it again"));
@@ -155,7 +155,7 @@ impl Model {
             Some(cost) => cost,
             none => none.insert(self.cost_model()?.0),
         };
-        py.detach(|| {
+        exit::detached(py, || {
             cost.observe(&batch, &(0..envs).collect::<Vec<_>>())?;
             cost.cost(Candidates { actions: &actions, envs, samples, horizon, dim }, &mut costs)
         })

@@ -1,6 +1,7 @@
 //! Small files of runs that several machines share: on this machine, or in an object store.
 
 use crate::errors::to_py_err;
+use crate::exit;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 use swm::core::Result;
@@ -8,7 +9,7 @@ use swm::data::{Location, objects};
 
 /// Runs a request without the interpreter lock.
 fn at<T: Send>(py: Python<'_>, location: &str, run: impl Send + FnOnce(&Location) -> Result<T>) -> PyResult<T> {
-    py.detach(|| run(&Location::parse(location)?)).map_err(to_py_err)
+    exit::detached(py, || run(&Location::parse(location)?)).map_err(to_py_err)
 }
 
 /// The content of a file; `None` if it does not exist.

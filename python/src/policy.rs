@@ -2,6 +2,7 @@
 
 use crate::cost::planning_model;
 use crate::errors::{attached, json, to_py_err};
+use crate::exit;
 use crate::observer::PythonObserver;
 use crate::world::World;
 use crate::{arrays, solver};
@@ -62,7 +63,8 @@ impl Actor {
     fn checkpoint(py: Python<'_>, world: &World, name: &str) -> PyResult<Self> {
         let world = world.lock()?;
         let (spec, slots) = (world.spec().clone(), world.pool().len());
-        let (policy, info) = py.detach(|| swm::resolver::checkpoint_policy(name, &spec, slots)).map_err(to_py_err)?;
+        let (policy, info) =
+            exit::detached(py, || swm::resolver::checkpoint_policy(name, &spec, slots)).map_err(to_py_err)?;
         Ok(Self { hashes: hash_of(Some(info.weights)), ..Self::new(policy, None) })
     }
 
@@ -72,7 +74,7 @@ impl Actor {
         let choice: PolicyChoice = json("policy", choice)?;
         let mut world = world.lock()?;
         let world = &mut *world;
-        let made = py.detach(move || {
+        let made = exit::detached(py, move || {
             let entry = swm::env(&world.spec().id, &swm::core::Origin::User)?.entry;
             swm::resolver::policy_of_choice(&entry, &choice, world)
         });
@@ -80,13 +82,15 @@ impl Actor {
         Ok(Self { hashes, ..Self::new(policy, None) })
     }
 
-    /// Creates a policy implemented in Python: `call(infos, active, fresh)` returns an array of actions. `infos` is a
-    /// copy of the dict of [`World::infos`]; `active` marks the slots that act, `fresh` the slots with a new episode.
+    /// Creates a policy implemented in Python: `call(infos, active, fresh, episodes)` returns an array of actions. `infos` is a
+    /// copy of the dict of [`World::infos`]; `active` marks the slots that act, `fresh` the slots with a new episode; `episodes` are
+    /// the keys of their episodes, as of [`World::episode_key`].
     #[staticmethod]
     fn python(world: &Bound<'_, World>, call: Py<PyAny>) -> PyResult<Self> {
         let infos = World::infos(world)?.unbind();
-        let fresh = vec![false; world.get().lock()?.pool().len()];
-        Ok(Self::new(Box::new(PythonPolicy { call, infos, fresh }), None))
+        let slots = world.get().lock()?.pool().len();
+        let (fresh, episodes) = (vec![false; slots], vec![0; slots]);
+        Ok(Self::new(Box::new(PythonPolicy { call, infos, fresh, episodes }), None))
     }
 
     /// Creates a planning policy. `model` is a [`crate::model::Model`], an adapter of `stable_worldmodel.planning`, or
@@ -116,7 +120,8 @@ impl Actor {
         let actions = swm::plan::ActionKind::of(&spec.action_space);
         swm::plan::pairing(solver, &mut *cost, actions).map_err(to_py_err)?;
         let log = TraceLog::default();
-        let policy = py.detach(|| MpcPolicy::new(search, cost, mpc, scale, &spec, slots)).map_err(to_py_err)?;
+        let policy =
+            exit::detached(py, || MpcPolicy::new(search, cost, mpc, scale, &spec, slots)).map_err(to_py_err)?;
         let policy = policy.traced(log.clone());
         let policy = match observer {
             Some(observer) => policy.observed(Box::new(PythonObserver::new(observer))),
@@ -225,15 +230,17 @@ struct PythonPolicy {
     call: Py<PyAny>,
     infos: Py<PyDict>,
     fresh: Vec<bool>,
+    episodes: Vec<u64>,
 }
 
 impl Policy for PythonPolicy {
-    fn begin(&mut self, slot: usize, _key: Key) {
+    fn begin(&mut self, slot: usize, key: Key) {
         self.fresh[slot] = true;
+        self.episodes[slot] = key.seed();
     }
 
     fn act(&mut self, _infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        let Self { call, infos, fresh } = self;
+        let Self { call, infos, fresh, episodes } = self;
         let called = attached(|py| {
             // Copies: a policy that changes its observation must not change what the engine stores.
             let given = PyDict::new(py);
@@ -242,7 +249,8 @@ impl Policy for PythonPolicy {
             }
             let infos = given;
             let flags = |flags: &[bool]| PyArray1::from_slice(py, flags);
-            let given = call.bind(py).call1((infos, flags(active), flags(fresh)))?;
+            let given =
+                call.bind(py).call1((infos, flags(active), flags(fresh), PyArray1::from_slice(py, episodes)))?;
             arrays::fill(actions, 0, &given)
         });
         fresh.fill(false);

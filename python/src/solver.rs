@@ -3,9 +3,11 @@
 use crate::arrays;
 use crate::cost::PythonCost;
 use crate::errors::{json, signal_poll, to_py_err};
+use crate::exit;
 use crate::model::Model;
 use crate::observer::PythonObserver;
 use crate::world::plan_key;
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -39,7 +41,8 @@ pub fn make(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
     (SOLVERS.get(solver).map_err(to_py_err)?.make)(&settings).map_err(to_py_err)
 }
 
-/// Plans for every row of `infos`, with the random key `(seed, call, row)`. Returns the actions, their costs, and the
+/// Plans for every row of `infos`, with the random key `(seed, call, row)`, or `(seed, episode, plan)` if `plans` has the key of the
+/// episode and the number of the plan of each row. Returns the actions, their costs, and the
 /// search traces as JSON.
 ///
 /// `low` and `high` are the bounds of the elements of a model step with continuous actions; `choices` holds the number
@@ -48,7 +51,7 @@ pub fn make(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
 /// # Shapes
 /// `infos`: `[envs, ..]`; `init` and actions: `[envs, horizon, dim]`; costs: `[envs]`.
 #[pyfunction]
-#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, call, observer=None))]
+#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, call, plans=None, observer=None))]
 #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
 pub fn solve<'py>(
     py: Python<'py>,
@@ -64,8 +67,10 @@ pub fn solve<'py>(
     init: Option<&Bound<'py, PyAny>>,
     seed: u64,
     call: u64,
+    plans: Option<Vec<(u64, u64)>>,
     observer: Option<Py<PyAny>>,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>, String)> {
+    let _call = exit::Call::begin();
     let mut solver = make(solver, settings)?;
     let space = match &choices {
         Some(choices) => PlanSpace::Discrete { choices },
@@ -73,7 +78,14 @@ pub fn solve<'py>(
     };
     let dim = space.dim();
     let init = init.map(|init| arrays::f32_values("init_action", init, &[envs, horizon, dim])).transpose()?;
-    let keys: Vec<Key> = (0..envs).map(|row| plan_key(seed).at(call).at(row as u64)).collect();
+    let plans = plans.unwrap_or_else(|| (0..envs).map(|row| (call, row as u64)).collect());
+    if plans.len() != envs {
+        return Err(PyValueError::new_err(format!(
+            "plans: expected {envs} pairs, one for each row, got {}",
+            plans.len()
+        )));
+    }
+    let keys: Vec<Key> = plans.iter().map(|&(first, second)| plan_key(seed).at(first).at(second)).collect();
     let problem = PlanProblem { horizon, space, keys: &keys, init: init.as_deref(), deadline: None, observer: None };
     let observer = observer.map(PythonObserver::new);
     let observer = observer.as_ref().map(|observer| observer as &dyn SearchObserver);
@@ -81,7 +93,7 @@ pub fn solve<'py>(
     let plan = if let Ok(model) = model.cast::<Model>() {
         let (mut cost, _) = model.get().cost_model()?;
         let batch = arrays::batch(infos)?;
-        py.detach(|| {
+        exit::detached(py, || {
             cost.observe(&batch, &(0..envs).collect::<Vec<_>>())?;
             control.install(None, |interrupt| {
                 let between = BetweenIterations { interrupt: Some(interrupt), observer };
@@ -92,7 +104,7 @@ pub fn solve<'py>(
         let mut cost = PythonCost::new(model)?;
         model.call_method1("observe", (infos,))?;
         cost.observed(envs);
-        py.detach(|| {
+        exit::detached(py, || {
             control.on_this_thread(|interrupt| {
                 let between = BetweenIterations { interrupt: Some(interrupt), observer };
                 let problem = PlanProblem { observer: between.observer(), ..problem };

@@ -1,6 +1,7 @@
 //! The results of studies.
 
 use crate::errors::to_py_err;
+use crate::exit;
 use pyo3::prelude::*;
 use std::path::Path;
 use swm::cli::study;
@@ -14,11 +15,11 @@ pub fn studies() -> PyResult<String> {
 /// The results of the study in a folder, as JSON.
 #[pyfunction]
 pub fn study_results(py: Python<'_>, folder: &str) -> PyResult<String> {
-    py.detach(|| Ok(study::results(Path::new(folder))?.to_string())).map_err(to_py_err)
+    exit::detached(py, || Ok(study::results(Path::new(folder))?.to_string())).map_err(to_py_err)
 }
 
 /// The table of the study in a folder, in a format of `swm study export`.
 #[pyfunction]
 pub fn study_export(py: Python<'_>, folder: &str, format: &str) -> PyResult<String> {
-    py.detach(|| study::export(Path::new(folder), format)).map_err(to_py_err)
+    exit::detached(py, || study::export(Path::new(folder), format)).map_err(to_py_err)
 }

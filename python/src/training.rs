@@ -4,6 +4,7 @@ use crate::arrays;
 use crate::data::dataset::Dataset;
 use crate::data::process::detached;
 use crate::errors::{json, to_py_err};
+use crate::exit;
 use numpy::{PyUntypedArray, PyUntypedArrayMethods as _};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -110,7 +111,7 @@ pub fn save_checkpoint(
     let (weights, moments) = (tensors(weights)?, tensors(moments)?);
     let raw = raw.map(tensors).transpose()?;
     let state = state.map(|state| StateParts { state, moments, raw });
-    py.detach(|| store(&run, Parts { file, manifest, weights, state }, replace)).map_err(to_py_err)
+    exit::detached(py, || store(&run, Parts { file, manifest, weights, state }, replace)).map_err(to_py_err)
 }
 
 /// Copies `float32` arrays by name.

@@ -3,7 +3,8 @@
 use crate::arrays;
 use crate::data::foreign::ForeignWriter;
 use crate::data::process::Owned;
-use crate::errors::{control, from_py_err, json, signal_poll, to_py_err};
+use crate::errors::{attached, control, from_py_err, json, signal_poll, to_py_err};
+use crate::exit;
 use crate::gym::{InProcess, is_in_call};
 use crate::policy::Actor;
 use crate::snapshots;
@@ -102,7 +103,7 @@ impl World {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
         let views: swm::core::Result<Vec<CameraView>> = views.iter().map(|text| CameraView::parse(text)).collect();
         let config = WorldConfig { envs, image, views: views.map_err(to_py_err)?, max_episode_steps, threads };
-        let world = py.detach(|| {
+        let world = exit::detached(py, || {
             let chosen = swm::env(&env, &Origin::User)?;
             swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
         });
@@ -126,9 +127,9 @@ impl World {
     ) -> PyResult<Self> {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
         let config = WorldConfig { envs, image, views: vec![], max_episode_steps, threads };
-        let world = py.detach(|| {
+        let world = exit::detached(py, || {
             let made = || -> swm::core::Result<Box<dyn Env>> {
-                let make = Python::attach(|py| make.clone_ref(py));
+                let make = attached(|py| Ok(make.clone_ref(py)))?;
                 Ok(stack.wrap(Box::new(GymEnv::new(&id, Box::new(InProcess::new(make)), 0)?), goal))
             };
             swm::eval::World::of(made, config)
@@ -149,6 +150,8 @@ impl World {
     /// Returns the infos of the last reset or step as arrays `[envs, 1, ..]`. The arrays share the engine's memory, so
     /// later steps change the arrays.
     pub fn infos<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
+        // The first array imports numpy.
+        let _call = exit::Call::begin();
         let infos = PyDict::new(slf.py());
         let world = slf.get().lock()?;
         let batch = world.pool().infos();
@@ -187,7 +190,7 @@ impl World {
         let world = &mut *world;
         let resets: Vec<Reset> =
             starts.iter().map(|&(slot, seed)| Reset { slot, seed, options: options.clone() }).collect();
-        py.detach(|| world.restart(&resets)).map_err(to_py_err)
+        exit::detached(py, || world.restart(&resets)).map_err(to_py_err)
     }
 
     /// Begins episode `episode` of `seed` in a slot of the policy. The environment is not reset.
@@ -201,14 +204,14 @@ impl World {
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let mut control = Control::new().with_poll(signal_poll());
-        py.detach(|| world.act_until(policy, &active, &mut control)).map_err(to_py_err)
+        exit::detached(py, || world.act_until(policy, &active, &mut control)).map_err(to_py_err)
     }
 
     /// Steps the active slots with the current actions.
     fn advance(&self, py: Python<'_>, active: Vec<bool>) -> PyResult<()> {
         let mut world = self.lock_to_run()?;
         let world = &mut *world;
-        py.detach(|| world.advance(&active)).map_err(to_py_err)
+        exit::detached(py, || world.advance(&active)).map_err(to_py_err)
     }
 
     /// Plays `steps` steps with a policy. A slot whose episode is over starts the next episode of `seed` instead of a
@@ -228,7 +231,7 @@ impl World {
         let (world, policy) = (&mut *world, &mut **policy);
         let mut begun = vec![];
         let mut control = Control::new().with_poll(signal_poll());
-        py.detach(|| {
+        exit::detached(py, || {
             let schema = world.pool().infos().schema();
             let flags = [schema.index(TERMINATED)?, schema.index(TRUNCATED)?];
             let mut active = vec![true; world.pool().len()];
@@ -280,7 +283,7 @@ impl World {
         let mut world = self.lock_to_run()?;
         let world = &mut *world;
         let snapshot = snapshots::unseal(state)?;
-        py.detach(|| world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(to_py_err)
+        exit::detached(py, || world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(to_py_err)
     }
 
     /// Collects episodes into a dataset at `path`, or into `writer`, an object with `write_episode`. Returns
@@ -307,7 +310,7 @@ impl World {
         let codec: ImageCodec = codec.map_or(Ok(ImageCodec::default()), |text| json("codec", text))?;
         let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
-        let collected = py.detach(|| {
+        let collected = exit::detached(py, || {
             let config = CollectConfig {
                 episodes: settings.episodes,
                 seed: settings.seed,
@@ -367,7 +370,7 @@ impl World {
         let settings: Evaluation = json("evaluation", config)?;
         let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
-        let run = py.detach(|| {
+        let run = exit::detached(py, || {
             let starts = match dataset {
                 Some(dataset) => {
                     let reader = swm::home::open_dataset(&dataset)?;
@@ -414,7 +417,7 @@ impl World {
     /// The number of episodes stored at a path; `None` if there is no dataset.
     #[staticmethod]
     fn stored(py: Python<'_>, path: &str, format: Option<&str>) -> PyResult<Option<usize>> {
-        let stored = py.detach(|| {
+        let stored = exit::detached(py, || {
             let location = swm::home::target(path, format)?;
             if location.path().is_some_and(|path| !path.exists()) {
                 return Ok(None);
@@ -423,6 +426,13 @@ impl World {
             Ok(Some(swm::data::open(location)?.episodes().len()))
         });
         stored.map_err(to_py_err)
+    }
+
+    /// The key of an episode, on which the random draws of policies depend.
+    #[staticmethod]
+    #[pyo3(name = "episode_key")]
+    fn key_of_episode(seed: u64, episode: usize) -> u64 {
+        episode_key(seed, episode).seed()
     }
 
     /// The seed of the environment's reset at the start of an episode.

@@ -66,6 +66,7 @@ def solve(
     init: _Array | None,
     seed: int,
     call: int,
+    plans: Sequence[tuple[int, int]] | None = None,
     observer: Any = None,
 ) -> tuple[_Array, _Array, str]: ...
 
@@ -121,6 +122,8 @@ class World:
     def stored(path: str, format: str | None) -> int | None: ...
     @staticmethod
     def episode_seed(seed: int, episode: int) -> int: ...
+    @staticmethod
+    def episode_key(seed: int, episode: int) -> int: ...
 
 class Actor:
     @staticmethod

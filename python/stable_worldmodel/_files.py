@@ -67,7 +67,13 @@ def replace(files: Mapping[Path, Callable[[Path], object]]) -> None:
     Who reads several of them under :func:`locked` reads them as they were written.
 
     A kill leaves `.NAME.NUMBER.tmp`, which the next `swm eval` into this folder deletes if NAME is its own.
+
+    Raises:
+        FileExistsError: If one is a folder, a device or a pipe.
     """
+    for path in files:
+        if path.exists() and not path.is_file():
+            raise FileExistsError(f"{path}: not a regular file; choose another name")
     # Other threads and processes may write the same file.
     beside = {path: path.with_name(f".{path.name}.{threading.get_native_id()}.tmp") for path in files}
     try:

@@ -17,7 +17,7 @@ import numpy as np
 from . import _engine, _options
 from .buffer import HistoryBuffer
 from .planning.adapter import has_torch, prepared
-from .planning.solver.engine import EngineSolver, NotConfigured, single
+from .planning.solver.engine import PLANS, EngineSolver, NotConfigured, single
 
 if TYPE_CHECKING:
     from .world import World
@@ -308,6 +308,8 @@ class MPCPolicy(BasePolicy):
         self._rest: dict[int, Any] = {}
         #: The past columns and the executed actions, in model units, of every environment.
         self._seen: list[HistoryBuffer] = []
+        #: The number of plans in the episode of every environment.
+        self._planned: list[int] = []
         self._done: list[HistoryBuffer] = []
 
     @property
@@ -320,6 +322,7 @@ class MPCPolicy(BasePolicy):
         self.solver.configure(action_space=env.action_space, n_envs=env.num_envs, config=self.cfg)
         self._actions = [[] for _ in range(env.num_envs)]
         self._rest = {}
+        self._planned = [0] * env.num_envs
         steps = max(1, (self.cfg.history_len - 1) * self.cfg.action_block)
         block = self.cfg.action_block
         self._seen = [HistoryBuffer(1, steps + 1, block) for _ in range(env.num_envs)]
@@ -352,12 +355,13 @@ class MPCPolicy(BasePolicy):
         if self.env is None:
             raise RuntimeError("MPCPolicy: it belongs to no world; call world.set_policy(policy) first")
         infos = dict(info_dict)
-        fresh, active = infos.pop("_needs_flush", None), infos.pop("_active", None)
+        fresh, active, episodes = (infos.pop(name, None) for name in ("_needs_flush", "_active", "_episode"))
         envs = self.env.num_envs
         for i in range(envs):
             if fresh is not None and fresh[i]:
                 self._actions[i].clear()
                 self._rest.pop(i, None)
+                self._planned[i] = 0
                 self._seen[i].reset()
                 self._done[i].reset()
         over = np.zeros(envs, bool) if active is None else ~np.asarray(active, bool)
@@ -367,7 +371,8 @@ class MPCPolicy(BasePolicy):
             for i in np.flatnonzero(~over).tolist():
                 self._seen[i].append({key: value[i : i + 1] for key, value in past.items()})
         if due:
-            self._replan({key: np.asarray(value)[due] for key, value in infos.items()}, due)
+            known = None if episodes is None else [int(episodes[i]) for i in due]
+            self._replan({key: np.asarray(value)[due] for key, value in infos.items()}, due, known)
         space = single(self.env.action_space, self.env.num_envs)
         shape = space.shape
         actions = np.full((envs, *shape), np.nan if space.dtype.kind == "f" else 0, dtype=space.dtype)
@@ -404,7 +409,8 @@ class MPCPolicy(BasePolicy):
         infos["action_history"] = actions
         return infos
 
-    def _replan(self, infos: dict[str, Any], due: list[int]) -> None:
+    def _replan(self, infos: dict[str, Any], due: list[int], episodes: list[int] | None) -> None:
+        """Plans for the environments `due`, in episodes with these keys."""
         known = [self._rest.get(i) for i in due]
         init: Any = None
         if self.cfg.warm_start and any(rest is not None for rest in known):
@@ -421,7 +427,14 @@ class MPCPolicy(BasePolicy):
         given = prepared(known_units, self.process, self.transform)
         if "action_history" in infos:
             given |= prepared({"action_history": infos["action_history"]}, {}, {})
-        outcome = self.solver.solve(given, init_action=init)
+        # So that a plan depends neither on the other environments nor on earlier episodes.
+        token = PLANS.set(episodes and [(episode, self._planned[i]) for episode, i in zip(episodes, due, strict=True)])
+        try:
+            outcome = self.solver.solve(given, init_action=init)
+        finally:
+            PLANS.reset(token)
+        for i in due:
+            self._planned[i] += 1
         if not isinstance(outcome, Mapping) or "actions" not in outcome:
             raise TypeError(f"{type(self.solver).__name__}.solve: expected a dict with 'actions', got {outcome!r:.200}")
         plan = outcome["actions"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from data_helpers import episode, episodes
 
+import stable_worldmodel as swm
 from stable_worldmodel import data
 
 
@@ -133,3 +134,23 @@ def test_goals_of_a_buffer_are_those_of_its_content_now():
         for sample in (goals[i] for i in range(len(goals))):
             assert sample["goal_episode"][0] == sample["episode"][0] and sample["goal_t"][0] > sample["t"][-1]
     assert len(pickle.loads(pickle.dumps(goals))) == len(goals)
+
+
+def test_writer_that_suppresses_its_error_collects_nothing_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.setenv("STABLEWM_HOME", str(tmp_path))
+
+    class Full:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            return True
+
+        def write_episode(self, episode):
+            raise OSError("the disk is full")
+
+    with swm.World("swm/TwoRoom-v1", 1, image_shape=(32, 32), max_episode_steps=5) as world:
+        world.set_policy(swm.policy.RandomPolicy(0))
+        with pytest.raises(OSError, match="the disk is full"):
+            world.collect(writer=Full(), episodes=3, seed=1, progress=False)
+    assert not list(tmp_path.iterdir())

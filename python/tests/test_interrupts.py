@@ -313,3 +313,37 @@ threading.Thread(target=lambda: world.{play}, progress=False), daemon=True).star
     for _ in range(3):
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
         assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("env", ["swm/TwoRoom-v1", "CartPole-v1"])
+def test_program_ends_silently_while_a_thread_calls_python_from_the_engine(env, tmp_path):
+    # torch, which is half imported when the interpreter ends, would print errors of its own.
+    program = """
+import sys, threading, time
+sys.modules["torch"] = None
+import numpy as np
+import stable_worldmodel as swm
+
+class Model:
+    backend = "numpy"
+
+    def get_cost(self, infos, candidates):
+        return (candidates ** 2).sum((-1, -2))
+
+def play():
+    world = swm.World(sys.argv[1], 2, image_shape=(32, 32), max_episode_steps=20, image_transform=lambda frame: frame)
+    if sys.argv[1] == "CartPole-v1":
+        world.set_policy(swm.policy.RandomPolicy(0))
+    else:
+        world.set_policy(swm.policy.MPCPolicy(swm.solver.CEMSolver(Model(), num_samples=64, n_steps=5, topk=8)))
+    world.collect(writer=swm.data.ReplayBuffer(10_000), episodes=10**7, progress=False)
+
+threading.Thread(target=play, daemon=True).start()
+time.sleep(float(sys.argv[2]))
+"""
+    for tenth in range(6):
+        command = [sys.executable, "-c", program, env, str(tenth / 10)]
+        # Without a folder for sockets, SDL prints an error.
+        variables = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=variables)
+        assert (done.returncode, done.stderr) == (0, "")

@@ -635,3 +635,35 @@ def test_candidates_that_a_model_keeps_do_not_change():
         solver.solve({"state": torch.zeros(2, 1)})
     assert len(kept) == 8 * 5
     assert all(bool((part == copy).all()) for part, copy in kept)
+
+
+class Towards:
+    """A cost model of Two-Room in numpy: the distance of the mean action from one that depends on the state."""
+
+    backend = "numpy"
+
+    def get_cost(self, infos, candidates):
+        states = np.asarray(infos["state"]).reshape(*candidates.shape[:2], -1)[..., -2:]
+        return ((candidates.mean(2) - np.sin(states)) ** 2).sum(-1)
+
+
+def test_plans_from_python_depend_on_the_episode_alone():
+    def played(world):
+        buffer = swm.data.ReplayBuffer(1000)
+        world.collect(writer=buffer, episodes=4, seed=0, progress=False)
+        return [episode["action"] for episode in buffer.episodes()]
+
+    def made(num_envs):
+        world = swm.World(
+            "swm/TwoRoom-v1", num_envs, image_shape=(32, 32), max_episode_steps=6, image_transform=lambda frame: frame
+        )
+        solver = swm.solver.CEMSolver(Towards(), num_samples=16, n_steps=3, topk=4)
+        world.set_policy(swm.policy.MPCPolicy(solver, swm.PlanConfig(horizon=3, receding_horizon=2)))
+        return world
+
+    with made(1) as one, made(4) as four:
+        expected = played(one)
+        assert not np.array_equal(expected[0], expected[1])
+        for again in (played(one), played(four)):
+            for actions, of_first in zip(again, expected, strict=True):
+                np.testing.assert_array_equal(actions, of_first)

@@ -10,6 +10,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -139,6 +140,46 @@ def test_python_policy_collects_new_and_appended_episodes(tmp_path):
     assert np.array_equal(one.get_col_data("state"), other.get_col_data("state"))
 
 
+class Smooth(Zero):
+    """A policy that depends on the action before."""
+
+    def get_action(self, infos, **kwargs):
+        return 0.8 * np.nan_to_num(infos["action"][:, 0]) + 0.1
+
+
+def test_the_action_before_the_first_is_that_of_no_other_episode(tmp_path):
+    def played(num_envs, before):
+        with rooms(num_envs=num_envs, max_episode_steps=5) as world:
+            world.set_policy(Smooth())
+            for _ in range(before):
+                world.evaluate(episodes=3, seed=1, progress=False, floor=False)
+            path = tmp_path / f"{num_envs}-{before}.lance"
+            world.collect(path, episodes=4, seed=0, progress=False)
+        stored = swm.data.load_dataset(path)
+        return [np.asarray(stored.load_episode(index)["action"]) for index in range(4)]
+
+    expected = played(1, 0)
+    np.testing.assert_allclose(expected[0][:2], [[0.1] * 2, [0.18] * 2], rtol=1e-5)
+    for case in ((4, 0), (4, 1), (1, 1)):
+        np.testing.assert_array_equal(played(*case), expected)
+
+
+@pytest.mark.parametrize("policy", [Zero(), swm.policy.RandomPolicy()])
+def test_infos_of_a_new_episode_have_no_action(policy):
+    with rooms(max_episode_steps=2) as world:
+        world.set_policy(policy)
+        world.reset(seed=0)
+        had = []
+        for _ in range(4):
+            world.step()
+            had.append(bool(np.isfinite(world.infos["action"]).all()))
+            assert np.isnan(world.infos["action"]).all() != had[-1]
+        assert had == [True, True, False, True]
+        state = world.snapshot(1)
+        world.restore(state, 1)
+        assert np.isnan(world.infos["action"][1]).all() and np.isfinite(world.infos["action"][0]).all()
+
+
 def test_evaluation_reports_intervals_and_the_random_floor(tmp_path):
     world = rooms()
     metrics = world.evaluate(
@@ -185,6 +226,18 @@ def test_results_and_videos_stay_on_this_machine(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="path: 'gs://bucket/r.json' is a URI"):
         metrics.save("gs://bucket/r.json")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_metrics_replace_no_pipe(tmp_path):
+    with rooms(num_envs=1, max_episode_steps=3) as world:
+        world.set_policy(Zero())
+        metrics = world.evaluate(episodes=1, seed=0, progress=False, floor=False)
+    os.mkfifo(tmp_path / "results.json")
+    (tmp_path / "other.json").symlink_to(tmp_path / "results.json")
+    for name in ("results.json", "other.json"):
+        with pytest.raises(FileExistsError, match="not a regular file"):
+            metrics.save(tmp_path / name)
+    assert (tmp_path / "results.json").is_fifo() and len(list(tmp_path.iterdir())) == 2
 
 
 def test_threads_save_metrics_to_one_file(tmp_path):
@@ -534,3 +587,20 @@ def test_policy_that_changes_its_observation_changes_nothing_that_is_stored(tmp_
         kept, changed = (dataset.load_episode(episode) for dataset in stored)
         for name in kept:
             np.testing.assert_array_equal(kept[name], changed[name], err_msg=name)
+
+
+def test_a_world_closes_all_environments_though_one_raises():
+    closed = []
+
+    class Stubborn(gym.Wrapper):
+        def close(self):
+            closed.append(self)
+            super().close()
+            if len(closed) == 1:
+                raise RuntimeError("it stays open")
+
+    world = swm.World("CartPole-v1", 3, image_shape=(32, 32), extra_wrappers=[Stubborn])
+    with pytest.raises(RuntimeError, match="it stays open"):
+        world.close()
+    world.close()
+    assert len(closed) == 3

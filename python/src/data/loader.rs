@@ -4,6 +4,7 @@ use super::dataset::Dataset;
 use super::process::{detached, is_forked};
 use super::{BatchMemory, Column, columns, described};
 use crate::errors::{json, signal_poll, to_py_err};
+use crate::exit;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
@@ -90,6 +91,7 @@ impl<T: Send> Threaded<T> {
         }
         match &mut *lock(&self.inner) {
             Some(inner) => work(inner),
+            None if exit::is_over() => Err(exit::end_of_thread()),
             None => Err(Error::config(
                 "loader",
                 "its threads ended when the interpreter shut down",
@@ -102,7 +104,8 @@ impl<T: Send> Threaded<T> {
 impl<T: Send> Drop for Threaded<T> {
     fn drop(&mut self) {
         if self.process == std::process::id() {
-            Python::attach(|py| py.detach(|| self.inner.end()));
+            // At the end of the interpreter, the threads have ended already.
+            Python::try_attach(|py| py.detach(|| self.inner.end()));
         } else {
             std::mem::forget(Arc::clone(&self.inner));
         }
@@ -174,7 +177,7 @@ impl Loader {
 
     /// The batches of an epoch, from batch `first` on.
     fn epoch(&self, py: Python<'_>, epoch: u64, first: usize) -> PyResult<Epoch> {
-        let begun = py.detach(|| self.0.with(|loader| Ok(loader.epoch(epoch, first))));
+        let begun = exit::detached(py, || self.0.with(|loader| Ok(loader.epoch(epoch, first))));
         Ok(Epoch(Threaded::new(begun.map_err(to_py_err)?)))
     }
 }

@@ -4,6 +4,7 @@
 //! ends. A forked process therefore opens datasets again, and runs the engine on one new thread. One thread is
 //! enough, because several forked processes usually run in parallel.
 
+use crate::exit;
 use pyo3::prelude::*;
 use std::sync::{Mutex, OnceLock, PoisonError};
 use swm::core::{Error, Result};
@@ -71,7 +72,7 @@ pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send
 /// # Errors
 /// A failure to start the thread of a forked process.
 pub fn in_pool<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> Result<T> {
-    py.detach(|| if is_forked() { Ok(forked_pool()?.install(work)) } else { Ok(work()) })
+    exit::detached(py, || if is_forked() { Ok(forked_pool()?.install(work)) } else { Ok(work()) })
 }
 
 /// The thread pool of this forked process, leaked because it lives until the process ends.

@@ -4,6 +4,7 @@ use super::dataset::Dataset;
 use super::{BatchMemory, Column, columns, schema};
 use crate::arrays;
 use crate::errors::{json, to_py_err};
+use crate::exit;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
@@ -44,7 +45,7 @@ impl ReplayBuffer {
     /// episodes until the new one fits.
     fn add(&self, py: Python<'_>, episode: &Bound<'_, PyDict>, constants: &Bound<'_, PyDict>) -> PyResult<()> {
         let (episode, constants) = (arrays::batch(episode)?, super::constants(constants)?);
-        py.detach(|| self.0.add(&episode, &constants)).map_err(to_py_err)
+        exit::detached(py, || self.0.add(&episode, &constants)).map_err(to_py_err)
     }
 
     /// The number of rows in the buffer.
@@ -82,7 +83,7 @@ impl ReplayBuffer {
 impl ReplaySampler {
     /// Samples batch `index`, which depends only on the seed, the index and the content of the buffer.
     fn sample<'py>(&self, py: Python<'py>, index: u64) -> PyResult<Bound<'py, PyDict>> {
-        let batch = py.detach(|| self.loader.sample(self.key.at(index))).map_err(to_py_err)?;
+        let batch = exit::detached(py, || self.loader.sample(self.key.at(index))).map_err(to_py_err)?;
         columns(py, BatchMemory::Loaded(batch))
     }
 }

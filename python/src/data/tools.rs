@@ -4,6 +4,7 @@ use super::dataset::Dataset;
 use super::image_codec;
 use super::process::detached;
 use crate::errors::{from_py_err, json, signal_poll, to_py_err};
+use crate::exit;
 use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Value, json as value};
@@ -169,7 +170,7 @@ pub fn find_dataset(path: &str) -> PyResult<String> {
 /// Completes or undoes an interrupted replacement of the dataset at a path or URI.
 #[pyfunction]
 pub fn recover(py: Python<'_>, path: &str) -> PyResult<()> {
-    py.detach(|| swm::data::recover(&Location::parse(path)?)).map_err(to_py_err)
+    exit::detached(py, || swm::data::recover(&Location::parse(path)?)).map_err(to_py_err)
 }
 
 /// The location for a new dataset, given by path, URI or name.

@@ -61,7 +61,7 @@ def _run(given: Sequence[str]) -> int:
     except (ValueError, TypeError, KeyError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
-    except (OSError, RuntimeError, FloatingPointError) as error:
+    except (OSError, RuntimeError, FloatingPointError, ImportError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 1
     return 0

@@ -230,7 +230,7 @@ class Trainer:
     def _seed(self, batch: int) -> None:
         """Makes random numbers depend on the batch only. Ranks that compute the whole batch draw the same."""
         own = 0 if self.losses.whole_batch else self.ranks.rank
-        torch.manual_seed((self.config["seed"] * 1_000_003 + batch) * 1_009 + own)
+        torch.manual_seed(((self.config["seed"] * 1_000_003 + batch) * 1_009 + own) % (1 << 63))
 
     def _move_average(self) -> None:
         if self.average is None:

@@ -69,7 +69,8 @@ def save_pretrained(
     """
     folder = _folder(cache_dir) / run_name
     settings, stored = folder / "config.json", folder / filename
-    if not filename or Path(filename).name != filename or filename in ("config.json", "manifest.json", "weights.safetensors"):
+    is_plain = filename and Path(filename).name == filename and filename not in ("config.json", "manifest.json")
+    if not is_plain or Path(filename).suffix == ".safetensors":
         raise ValueError(f"filename: expected a plain name for the weights, such as 'weights.pt', got {filename!r}")
     if (folder / "weights.safetensors").exists():
         raise FileExistsError(f"{folder}: it holds a checkpoint of the engine; choose another run_name")

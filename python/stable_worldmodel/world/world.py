@@ -145,6 +145,8 @@ class World:
         self.seed: int | None = None
         self._actors: dict[int, tuple[Any, Any]] = {}
         self._episodes = [0] * self.num_envs
+        #: The engine's keys of these episodes.
+        self._episode_keys = np.zeros(self.num_envs, np.uint64)
         self._next_episode = 0
         #: Whether `collect` or `evaluate` is calling a policy implemented in Python.
         self._calling = False
@@ -217,12 +219,17 @@ class World:
     def close(self) -> None:
         """Closes the environments and ends their worker processes. The world cannot be used afterwards."""
         self._actors.clear()
-        for env in self.gym_envs:
-            env.close()
-        self.gym_envs.clear()
+        failures: list[Exception] = []
+        while self.gym_envs:
+            try:
+                self.gym_envs.pop(0).close()
+            except Exception as error:
+                failures.append(error)
         # The arrays keep the engine's world alive: release them first.
         self.infos, self._frames, self._actions = {}, {}, np.empty(0)
         self.__dict__.pop("_world", None)
+        if failures:
+            raise failures[0]
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         raise TypeError("a World holds running environments and cannot be pickled; create it in the process that uses it")
@@ -285,7 +292,6 @@ class World:
         self._next_episode = self.num_envs
         self._reset_slots([(slot, self._seed_of(slot)) for slot in range(self.num_envs)])
         self._begin(range(self.num_envs))
-        self._actions[:] = np.nan if self._actions.dtype.kind == "f" else -1
         self._transform()
 
     def _seed_of(self, episode: int) -> int:
@@ -347,7 +353,9 @@ class World:
             for slot, episode in begun:
                 self._episodes[slot] = episode
             if begun:
-                self._show_factors([slot for slot, _ in begun])
+                slots = [slot for slot, _ in begun]
+                self._show_factors(slots)
+                self._forget_actions([slot for slot in slots if self.infos["step_idx"][slot] == 0])
             if self._any_fresh:
                 self._fresh.fill(False)
                 self._any_fresh = False
@@ -359,6 +367,7 @@ class World:
             active = ~over
             if active.any():
                 infos = {**self.infos, "_needs_flush": self._fresh.copy(), "_active": active}
+                infos["_episode"] = self._episode_keys.copy()
                 self._actions[:] = self._checked_actions(self.policy, infos, active)
                 self._fresh[:] = False
                 self._world.advance(active.tolist())
@@ -397,6 +406,7 @@ class World:
         if self.seed is None:
             self.reset()
         self._world.restore(index, state)
+        self._forget_actions([index])
         self._show_factors([index])
         self._transform()
 
@@ -410,7 +420,14 @@ class World:
             raise IndexError(f"index: {index!r}; the world has {self.num_envs} environments, with indices from 0")
         return index
 
+    def _forget_actions(self, slots: Sequence[int] | np.ndarray) -> None:
+        """Marks in the infos that environments had no action yet: NaN, or -1 for whole numbers."""
+        self._actions[slots] = np.nan if self._actions.dtype.kind == "f" else -1
+
     def _begin(self, slots: Sequence[int]) -> None:
+        self._forget_actions(list(slots))
+        for slot in slots:
+            self._episode_keys[slot] = _engine.World.episode_key(self.seed or 0, self._episodes[slot])
         self._fresh[list(slots)] = True
         self._any_fresh = True
         # Those that act within a policy implemented in Python as well.
@@ -490,8 +507,9 @@ class World:
         if actor is not None:
             return actor
 
-        def call(infos: dict[str, Any], active: np.ndarray, fresh: np.ndarray) -> np.ndarray:
-            infos |= {"_needs_flush": fresh, "_active": active, "action": self.infos["action"]}
+        def call(infos: dict[str, Any], active: np.ndarray, fresh: np.ndarray, episodes: np.ndarray) -> np.ndarray:
+            self._forget_actions(fresh)
+            infos |= {"_needs_flush": fresh, "_active": active, "_episode": episodes, "action": self.infos["action"]}
             if "goal" not in self.infos:
                 infos.pop("goal", None)
             for key in self._frames.keys() & infos.keys():
@@ -581,8 +599,16 @@ class World:
             "wrappers": [{"id": id, "settings": settings} for id, settings in self._wrapping],
         }
         if writer is not None:
+            failed: BaseException | None = None
             with writer as opened:
-                return self._collect(policy, None, opened, None, "create", None, config, progress)
+                try:
+                    return self._collect(policy, None, opened, None, "create", None, config, progress)
+                except BaseException as error:
+                    failed = error
+                    raise
+            # The writer suppressed the error, but there is no collection to report.
+            assert failed is not None
+            raise failed
         if mode == "append":
             config["episodes"] += _engine.World.stored(str(path), format) or 0
         engine_mode = {"error": "create", "resume": "append"}.get(mode, mode)

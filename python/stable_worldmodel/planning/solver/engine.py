@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from contextvars import ContextVar
 from functools import lru_cache
 from threading import Lock
 from typing import Any, ClassVar
@@ -19,6 +20,9 @@ from .hooks import Observer, Watched, view
 
 __all__ = ["EngineSolver", "NotConfigured", "last_step", "single", "summed_costs"]
 
+
+#: The episode's key and the number of the plan, for each row of the next call of `solve`: see `MPCPolicy`.
+PLANS: ContextVar[list[tuple[int, int]] | None] = ContextVar("PLANS", default=None)
 
 #: Held while a call of `solve` takes its number; not by the solvers, because locks cannot be pickled.
 _COUNTING = Lock()
@@ -137,7 +141,8 @@ class EngineSolver:
     def solve(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
         """Plans for every row of `info_dict` `(B, T, ..)`.
 
-        Each call uses new random numbers. The same sequence of calls with the same seed returns the same plans.
+        Each call uses new random numbers. The same sequence of calls with the same seed returns the same plans. (In an
+        `MPCPolicy`, they depend on the episode and the number of the plan in it instead.)
 
         Args:
             info_dict: Infos `(B, T, ..)`.
@@ -166,6 +171,10 @@ class EngineSolver:
         watched: Any = Watched(model, observer) if isinstance(model, Adapter) else None
         given = model if watched is None else watched
         observer.begin(envs)
+        plans = PLANS.get()
+        PLANS.set(None)
+        if plans is not None and len(plans) != envs:
+            plans = None  # A user-defined solver plans for other rows.
         with _COUNTING:
             call, self._solved = self._solved, self._solved + 1
         with self._mode(model):
@@ -182,6 +191,7 @@ class EngineSolver:
                 init,
                 self.seed,
                 call,
+                plans,
                 observer if self.callbacks else None,
             )
         observer.end()

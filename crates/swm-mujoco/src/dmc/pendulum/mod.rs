@@ -1,5 +1,7 @@
 //! Pendulum: swing up a pendulum with a motor that is too weak to lift it directly (`dm_control/suite/pendulum.py`).
 
+mod expert;
+
 use super::domain::{Domain, TaskTable, tasks};
 use super::measures::uprightness;
 use super::model_edit::ModelEdit;
@@ -13,7 +15,7 @@ use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
 /// The registry row of this domain.
-pub const ENTRY: EnvEntry = entry::<Pendulum>(&[]);
+pub const ENTRY: EnvEntry = entry::<Pendulum>(expert::EXPERTS);
 
 /// Deviation from the vertical that counts as upright, in radians (8 degrees).
 const UPRIGHT_ANGLE: f64 = 8.0 * std::f64::consts::PI / 180.0;

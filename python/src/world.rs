@@ -150,8 +150,7 @@ impl World {
     /// Returns the infos of the last reset or step as arrays `[envs, 1, ..]`. The arrays share the engine's memory, so
     /// later steps change the arrays.
     pub fn infos<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
-        // The first array imports numpy.
-        let _call = exit::Call::begin();
+        let _call = exit::Call::begin(); // The first array imports numpy.
         let infos = PyDict::new(slf.py());
         let world = slf.get().lock()?;
         let batch = world.pool().infos();
@@ -430,8 +429,7 @@ impl World {
 
     /// The key of an episode, on which the random draws of policies depend.
     #[staticmethod]
-    #[pyo3(name = "episode_key")]
-    fn key_of_episode(seed: u64, episode: usize) -> u64 {
+    fn episode_key(seed: u64, episode: usize) -> u64 {
         episode_key(seed, episode).seed()
     }
 

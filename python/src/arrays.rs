@@ -1,5 +1,6 @@
 //! Conversion between the columns of batches and numpy arrays.
 
+use crate::exit::Call;
 use numpy::ndarray::{ArrayView, IxDyn};
 use numpy::{Element, PyArray1, PyArrayDyn, PyArrayMethods as _, PyReadonlyArrayDyn, PyUntypedArrayMethods as _};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -37,6 +38,8 @@ pub fn copy_rows<'py>(py: Python<'py>, batch: &Batch, column: usize, rows: &[usi
 /// # Panics
 /// If the number of bytes does not match the shape.
 pub fn array<'py>(py: Python<'py>, dtype: DType, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
+    // The first array imports numpy.
+    let _call = Call::begin();
     fn make<'py, T: Element + Copy>(py: Python<'py>, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
         let array = PyArrayDyn::<T>::zeros(py, IxDyn(shape), false);
         // SAFETY: the new array is contiguous and has no other reference. It has the size of `bytes` (asserted). Bytes are

@@ -61,13 +61,19 @@ pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send
     }
 }
 
+/// Notes that this thread ends the interpreter.
+pub fn begin_end() {
+    ENDED_BY.get_or_init(|| thread::current().id());
+}
+
 /// Stops the calls of the engine in other threads and waits for their end. Python calls this function before the interpreter
 /// shuts down.
 #[pyfunction]
 pub fn end_calls(py: Python<'_>) {
-    if is_forked() || ENDED_BY.set(thread::current().id()).is_err() {
+    if is_forked() {
         return;
     }
+    begin_end();
     let begun = Instant::now();
     py.detach(|| {
         while CALLS.load(Ordering::SeqCst) > 0 && begun.elapsed() < PATIENCE {

@@ -428,7 +428,8 @@ class MPCPolicy(BasePolicy):
         if "action_history" in infos:
             given |= prepared({"action_history": infos["action_history"]}, {}, {})
         # So that a plan depends neither on the other environments nor on earlier episodes.
-        token = PLANS.set(episodes and [(episode, self._planned[i]) for episode, i in zip(episodes, due, strict=True)])
+        plans = [(episode, self._planned[i]) for episode, i in zip(episodes or [], due, strict=False)]
+        token = PLANS.set(plans or None)
         try:
             outcome = self.solver.solve(given, init_action=init)
         finally:

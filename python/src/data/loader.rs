@@ -136,6 +136,7 @@ fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 #[pyfunction]
 pub fn end_loaders(py: Python<'_>) {
     if !is_forked() {
+        exit::begin_end();
         py.detach(|| {
             let live: Vec<_> = lock(&LIVE).drain(..).collect();
             live.iter().filter_map(Weak::upgrade).for_each(|loader| loader.end());

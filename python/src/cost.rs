@@ -3,6 +3,7 @@
 
 use crate::arrays;
 use crate::errors::{attached, to_py_err};
+use crate::exit;
 use crate::model::Model;
 use numpy::{IxDyn, PyArrayDyn, PyArrayMethods as _, PyUntypedArrayMethods as _};
 use pyo3::ffi;
@@ -155,14 +156,14 @@ impl CostModel for PythonCost {
             for (i, column) in infos.schema().columns().iter().enumerate() {
                 dict.set_item(&column.name, arrays::copy_rows(py, infos, i, envs)?)?;
             }
-            adapter.call_method1("observe", (dict,)).map(drop)
+            exit::call_method(adapter, "observe", (dict,)).map(drop)
         })
     }
 
     fn cost(&mut self, given: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.call(|adapter| {
             let candidates = self.buffers.borrow_mut().filled(adapter.py(), given)?;
-            let returned = adapter.call_method1("cost", (candidates,))?;
+            let returned = exit::call_method(adapter, "cost", (candidates,))?;
             arrays::copy_f32("the costs of the model", &returned, &[given.envs, given.samples], costs)
         })
     }
@@ -185,7 +186,7 @@ impl DifferentiableCost for PythonCost {
         self.call(|adapter| {
             let shape = [given.envs, given.samples, given.horizon, given.dim];
             let candidates = self.buffers.borrow_mut().filled(adapter.py(), given)?;
-            let returned = adapter.call_method1("cost_and_gradient", (candidates,))?;
+            let returned = exit::call_method(adapter, "cost_and_gradient", (candidates,))?;
             let (values, gradients): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
             arrays::copy_f32("the costs of the model", &values, &shape[..2], costs)?;
             arrays::copy_f32("the gradient of the model's costs", &gradients, &shape, gradient)
@@ -201,7 +202,8 @@ impl LatentDynamics for PythonCost {
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
         let shape = [self.envs, self.latent_dim()];
         self.call(|adapter| {
-            let (current, target): (Bound<'_, PyAny>, Bound<'_, PyAny>) = adapter.call_method0("encode")?.extract()?;
+            let (current, target): (Bound<'_, PyAny>, Bound<'_, PyAny>) =
+                exit::call_method(adapter, "encode", ())?.extract()?;
             arrays::copy_f32("the latents of the current observation", &current, &shape, start)?;
             arrays::copy_f32("the latents of the goal", &target, &shape, goal)
         })
@@ -213,7 +215,7 @@ impl LatentDynamics for PythonCost {
             let (py, n) = (adapter.py(), latents.len() / dim);
             let given =
                 (arrays::f32_array(py, latents, &[n, dim])?, arrays::f32_array(py, actions, &[n, actions.len() / n])?);
-            let returned = adapter.call_method1("predict", given)?;
+            let returned = exit::call_method(adapter, "predict", given)?;
             arrays::copy_f32("the predicted latents", &returned, &[n, dim], next)
         })
     }
@@ -235,7 +237,7 @@ impl LatentDynamics for PythonCost {
                 arrays::f32_array(py, actions, &[n, action_dim])?,
                 arrays::f32_array(py, next_gradient, &[n, dim])?,
             );
-            let returned = adapter.call_method1("predict_vjp", given)?;
+            let returned = exit::call_method(adapter, "predict_vjp", given)?;
             let (latent, action): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
             let what = "the gradient of a prediction";
             arrays::copy_f32(what, &latent, &[n, dim], latent_gradient)?;
@@ -246,7 +248,7 @@ impl LatentDynamics for PythonCost {
 
 impl Constrained for PythonCost {
     fn constraints(&self, horizon: usize) -> usize {
-        self.call(|adapter| adapter.call_method1("constraints", (horizon,))?.extract()).unwrap_or_else(|error| {
+        self.call(|adapter| exit::call_method(adapter, "constraints", (horizon,))?.extract()).unwrap_or_else(|error| {
             self.failed.replace(Some(error));
             1
         })
@@ -255,7 +257,7 @@ impl Constrained for PythonCost {
     fn constrain(&mut self, given: Candidates<'_>, values: &mut [f32]) -> Result<()> {
         let n = values.len() / (given.envs * given.samples);
         self.call(|adapter| {
-            let returned = adapter.call_method1("constrain", (candidates(adapter.py(), given)?,))?;
+            let returned = exit::call_method(adapter, "constrain", (candidates(adapter.py(), given)?,))?;
             let shape = [given.envs, given.samples, n];
             arrays::copy_f32("the constraints of the model", &returned, &shape, values)
         })
@@ -266,7 +268,7 @@ impl Constrained for PythonCost {
         self.call(|adapter| {
             let py = adapter.py();
             let weights = arrays::f32_array(py, weights, &[given.envs, given.samples, n])?;
-            let returned = adapter.call_method1("constrain_vjp", (candidates(py, given)?, weights))?;
+            let returned = exit::call_method(adapter, "constrain_vjp", (candidates(py, given)?, weights))?;
             let shape = [given.envs, given.samples, given.horizon, given.dim];
             let added = arrays::f32_values("the gradient of the model's constraints", &returned, &shape)?;
             gradient.iter_mut().zip(added).for_each(|(to, more)| *to += more);

@@ -1,6 +1,6 @@
 //! Conversion between engine errors and Python exceptions; Python's signals and progress in the engine's loops.
 
-use crate::exit::is_over;
+use crate::exit::{self, is_over};
 use pyo3::exceptions::{PyFileNotFoundError, PyKeyboardInterrupt, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -89,7 +89,7 @@ pub fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
         }
         last = Some(Instant::now());
         let steps = at.metric("steps").unwrap_or_default() as usize;
-        let outcome = Python::try_attach(|py| call.call1(py, (at.done, at.total, steps)).map(drop));
+        let outcome = Python::try_attach(|py| exit::call(call.bind(py), (at.done, at.total, steps)).map(drop));
         if let Some(Err(error)) = outcome {
             callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }

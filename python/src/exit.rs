@@ -1,10 +1,12 @@
-//! The end of the interpreter. A thread that takes the GIL afterwards is ended by Python, in the middle of the engine, which aborts the
-//! process. So the calls of the engine in other threads are stopped before, and new ones end their threads.
+//! The end of the interpreter. Python before 3.14 ends a thread that takes the GIL afterwards by unwinding its stack, which aborts the
+//! process where the unwinding meets the engine. So the calls of the engine in other threads are stopped before, new ones end their
+//! threads, and a thread that Python unwinds out of a user's code stops at [`call`].
 
-use crate::data::process::is_forked;
 use crate::errors::from_py_err;
 use pyo3::exceptions::PySystemExit;
+use pyo3::ffi::PyObject;
 use pyo3::prelude::*;
+use pyo3::types::PyTuple;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::{self, ThreadId};
@@ -67,12 +69,9 @@ pub fn begin_end() {
 }
 
 /// Stops the calls of the engine in other threads and waits for their end. Python calls this function before the interpreter
-/// shuts down.
+/// shuts down (`stable_worldmodel/_exit.py`).
 #[pyfunction]
 pub fn end_calls(py: Python<'_>) {
-    if is_forked() {
-        return;
-    }
     begin_end();
     let begun = Instant::now();
     py.detach(|| {
@@ -80,4 +79,57 @@ pub fn end_calls(py: Python<'_>) {
             thread::sleep(Duration::from_millis(1));
         }
     });
+}
+
+/// Stops the thread for ever when it is dropped.
+struct Halt;
+
+impl Drop for Halt {
+    fn drop(&mut self) {
+        loop {
+            thread::park();
+        }
+    }
+}
+
+#[allow(unsafe_code, reason = "PyO3 declares the functions of Python without the permission to unwind")]
+unsafe extern "C-unwind" {
+    /// Calls an object with positional arguments. Returns a new reference, or null with an exception.
+    fn PyObject_CallObject(callable: *mut PyObject, arguments: *mut PyObject) -> *mut PyObject;
+}
+
+/// Calls code of a user, which may outlast the interpreter. If Python unwinds the thread out of it, the thread stops here, until
+/// the process ends.
+///
+/// # Errors
+/// The exception of the call.
+pub fn call<'py, A>(callable: &Bound<'py, PyAny>, arguments: A) -> PyResult<Bound<'py, PyAny>>
+where
+    A: IntoPyObject<'py, Target = PyTuple, Output = Bound<'py, PyTuple>>,
+{
+    let py = callable.py();
+    let arguments = arguments.into_pyobject(py).map_err(Into::into)?;
+    // Dropped by unwinding only, and first.
+    let halt = Halt;
+    // SAFETY: the thread holds the GIL, both pointers are those of living objects, the second that of a tuple, and the
+    // function may unwind.
+    #[allow(unsafe_code, reason = "as above")]
+    let returned = unsafe { PyObject_CallObject(callable.as_ptr(), arguments.as_ptr()) };
+    std::mem::forget(halt);
+    // SAFETY: the function returns a new reference, or null with an exception.
+    #[allow(unsafe_code, reason = "as above")]
+    unsafe {
+        Bound::from_owned_ptr_or_err(py, returned)
+    }
+}
+
+/// Calls a method of an object of a user, as [`call`] does.
+///
+/// # Errors
+/// The exception of the call; `AttributeError` if there is no such method.
+pub fn call_method<'py, A>(object: &Bound<'py, PyAny>, name: &str, arguments: A) -> PyResult<Bound<'py, PyAny>>
+where
+    A: IntoPyObject<'py, Target = PyTuple, Output = Bound<'py, PyTuple>>,
+{
+    call(&object.getattr(name)?, arguments)
 }

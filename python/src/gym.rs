@@ -78,11 +78,12 @@ impl Transport for InProcess {
 
     fn describe(&mut self) -> Result<Description, Failure> {
         in_python(|py| {
-            let bridge = self.make.bind(py).call0().map_err(refused)?;
-            let text: String = bridge.call_method0("describe").and_then(|text| text.extract()).map_err(refused)?;
+            let bridge = exit::call(self.make.bind(py), ()).map_err(refused)?;
+            let text: String =
+                exit::call_method(&bridge, "describe", ()).and_then(|text| text.extract()).map_err(refused)?;
             let description = Description::parse(&text).map_err(Failure::Refused)?;
             let memory = PyByteArray::new(py, &vec![0; description.size]);
-            bridge.call_method1("attach", (&memory,)).map_err(refused)?;
+            exit::call_method(&bridge, "attach", (&memory,)).map_err(refused)?;
             self.bridge = Some(bridge.unbind());
             let address = memory.data().expose_provenance();
             self.memory = Some(Memory { address, size: memory.len(), _owner: memory.unbind() });
@@ -97,7 +98,7 @@ impl Transport for InProcess {
             };
             let payload = PyBytes::new(py, request.payload());
             let _call = Call::begin();
-            bridge.bind(py).call_method1("handle", (request.op(), payload)).map(drop).map_err(refused)
+            exit::call_method(bridge.bind(py), "handle", (request.op(), payload)).map(drop).map_err(refused)
         })
     }
 

@@ -52,6 +52,8 @@ mod _engine {
     #[pymodule_export]
     use super::env::NativeEnv;
     #[pymodule_export]
+    use super::exit::end_calls;
+    #[pymodule_export]
     use super::frames::{VisualWrappers, schedule, write_video};
     #[pymodule_export]
     use super::gym::bridge;
@@ -77,9 +79,10 @@ mod _engine {
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         let _call = exit::Call::begin();
+        if module.py().import("stable_worldmodel._exit")?.getattr("check_thread")?.call0()?.extract()? {
+            exit::begin_end();
+        }
         data::process::record_process();
-        let at_exit = wrap_pyfunction!(exit::end_calls, module)?;
-        module.py().import("atexit")?.call_method1("register", (at_exit,))?;
         let finder = module.py().import("stable_worldmodel._zoo")?;
         if let Some(folder) = finder.getattr("data_wheel")?.call0()?.extract::<Option<PathBuf>>()? {
             swm::zoo::set_data_wheel(folder);

@@ -2,6 +2,7 @@
 
 use crate::arrays;
 use crate::errors::attached;
+use crate::exit;
 use numpy::{PyArray1, PyArrayMethods as _};
 use pyo3::prelude::*;
 use std::ops::ControlFlow;
@@ -39,7 +40,7 @@ impl SearchObserver for PythonObserver {
             let (candidates, costs) =
                 (arrays::f32_array(py, given.actions, &shape)?, arrays::f32_array(py, iteration.costs, &shape[..2])?);
             let arguments = (iteration.index, candidates, costs, elites, gradient);
-            self.0.bind(py).call_method1("iteration", arguments)?.extract::<bool>()
+            exit::call_method(self.0.bind(py), "iteration", arguments)?.extract::<bool>()
         });
         Ok(if stop? { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
     }
@@ -47,10 +48,10 @@ impl SearchObserver for PythonObserver {
 
 impl PlanObserver for PythonObserver {
     fn begin(&self, slots: &[usize]) -> Result<()> {
-        attached(|py| self.0.bind(py).call_method1("begin", (slots.len(),)).map(drop))
+        attached(|py| exit::call_method(self.0.bind(py), "begin", (slots.len(),)).map(drop))
     }
 
     fn end(&self) -> Result<()> {
-        attached(|py| self.0.bind(py).call_method0("end").map(drop))
+        attached(|py| exit::call_method(self.0.bind(py), "end", ()).map(drop))
     }
 }

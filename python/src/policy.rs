@@ -250,7 +250,7 @@ impl Policy for PythonPolicy {
             let infos = given;
             let flags = |flags: &[bool]| PyArray1::from_slice(py, flags);
             let given =
-                call.bind(py).call1((infos, flags(active), flags(fresh), PyArray1::from_slice(py, episodes)))?;
+                exit::call(call.bind(py), (infos, flags(active), flags(fresh), PyArray1::from_slice(py, episodes)))?;
             arrays::fill(actions, 0, &given)
         });
         fresh.fill(false);

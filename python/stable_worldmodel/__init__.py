@@ -15,6 +15,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from . import _exit as _exit
 from . import _registration
 
 if TYPE_CHECKING:

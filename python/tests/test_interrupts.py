@@ -347,3 +347,60 @@ time.sleep(float(sys.argv[2]))
         variables = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=variables)
         assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_program_ends_while_a_policy_outlasts_it():
+    # The policy wakes up after the five seconds that the end of the interpreter waits, while Python deletes its modules.
+    program = """
+import sys, threading, time
+import stable_worldmodel as swm
+
+class Slow:
+    def __del__(self, sleep=time.sleep):
+        sleep(3)
+
+class Policy(swm.policy.BasePolicy):
+    def get_action(self, infos):
+        playing.set()
+        time.sleep(6.5)
+        return self.env.action_space.sample()
+
+def play():
+    world = swm.World("swm/TwoRoom-v1", 2, image_shape=(32, 32), max_episode_steps=20)
+    world.set_policy(Policy())
+    world.collect(writer=swm.data.ReplayBuffer(10_000), episodes=10, progress=False)
+
+sys.slow, playing = Slow(), threading.Event()
+threading.Thread(target=play, daemon=True).start()
+playing.wait()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_engine_is_not_loaded_after_the_end_of_the_program():
+    # The first function that was registered runs last.
+    program = """
+import atexit, threading, time
+
+@atexit.register
+def wait():
+    ending.set()
+    ended.wait()
+    print("thread", "loaded" if loaded else "ended")
+
+import stable_worldmodel as swm
+
+def play():
+    try:
+        ending.wait()
+        world = swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False, max_episode_steps=25)
+        loaded.append(world)
+    finally:
+        ended.set()
+
+ending, ended, loaded = threading.Event(), threading.Event(), []
+threading.Thread(target=play, daemon=True).start()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "thread ended\n", "")

@@ -3,6 +3,7 @@
 use super::{Column, described, schema};
 use crate::arrays;
 use crate::errors::attached;
+use crate::exit;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use swm::core::columns::{EPISODE_IDX, STEP_IDX};
@@ -27,11 +28,11 @@ impl ForeignReader {
     /// # Errors
     /// If the object raises, or a column has a type that cannot be stored.
     pub fn new(py: Python<'_>, object: Py<PyAny>) -> PyResult<Self> {
-        let given: Vec<Column> = object.call_method0(py, "schema")?.extract(py)?;
+        let given: Vec<Column> = exit::call_method(object.bind(py), "schema", ())?.extract()?;
         let indices = INDEX_COLUMNS.map(|name| (name.to_owned(), "int64".to_owned(), vec![]));
         let data = given.into_iter().filter(|(name, ..)| !INDEX_COLUMNS.contains(&name.as_str()));
         let schema = schema(indices.into_iter().chain(data).collect())?;
-        let lengths: Vec<usize> = object.call_method0(py, "lengths")?.extract(py)?;
+        let lengths: Vec<usize> = exit::call_method(object.bind(py), "lengths", ())?.extract()?;
         let episodes = lengths.into_iter().enumerate().map(|(i, length)| Episode { index: i as i64, length }).collect();
         Ok(Self { object, schema, episodes })
     }
@@ -39,7 +40,7 @@ impl ForeignReader {
     fn rows(&self, column: &str, range: &StepRange) -> Result<Batch> {
         let rows: Batch = attached(|py| {
             let arguments = (column, range.episode, range.start, range.length);
-            let rows = self.object.bind(py).call_method1("rows", arguments)?;
+            let rows = exit::call_method(self.object.bind(py), "rows", arguments)?;
             let dict = PyDict::new(py);
             dict.set_item(column, rows)?;
             arrays::batch(&dict)
@@ -131,7 +132,7 @@ impl Writer for ForeignWriter {
                     dict.set_item(&column.name, arrays::array(py, column.dtype, &shape, episode.bytes(i))?)?;
                 }
             }
-            self.object.call_method1(py, "write_episode", (dict,))
+            exit::call_method(self.object.bind(py), "write_episode", (dict,)).map(drop)
         };
         attached(write)?;
         self.episodes += 1;

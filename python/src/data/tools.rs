@@ -68,7 +68,7 @@ fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let Some(progress) = progress else { return control };
     control.with_events(move |event| {
         let Event::Progress(at) = event else { return };
-        let outcome = Python::try_attach(|py| progress.call1(py, (at.stage, at.done, at.total)).map(drop));
+        let outcome = Python::try_attach(|py| exit::call(progress.bind(py), (at.stage, at.done, at.total)).map(drop));
         if let Some(Err(error)) = outcome {
             callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }

@@ -1,6 +1,8 @@
 //! Acrobot: two links hang from a bar; a motor between them must swing the tip up to a target
 //! (`dm_control/suite/acrobot.py`, model after Coulom 2002).
 
+mod expert;
+
 use super::domain::{Domain, TaskTable, tasks};
 use super::measures::distance;
 use super::model_edit::ModelEdit;
@@ -14,7 +16,7 @@ use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
 /// The registry row of this domain.
-pub const ENTRY: EnvEntry = entry::<Acrobot>(&[]);
+pub const ENTRY: EnvEntry = entry::<Acrobot>(expert::EXPERTS);
 
 /// Radius of the target, in metres.
 const TARGET_RADIUS: f64 = 0.2;

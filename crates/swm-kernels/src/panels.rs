@@ -98,12 +98,13 @@ impl Panels {
             let width = WIDTH.min(self.outputs - first);
             for (input, pair) in panel.iter_mut().enumerate() {
                 let row = &rows[starts.of(input) + first..][..width];
-                let (filled, rest) = pair.split_at_mut(width.div_ceil(LANES));
-                for (lanes, row) in filled.iter_mut().zip(row.chunks(LANES)) {
-                    lanes.0[..row.len()].copy_from_slice(row);
-                    lanes.0[row.len()..].fill(0.0);
-                }
+                let (whole, part) = row.as_chunks::<LANES>();
+                let (filled, rest) = pair.split_at_mut(whole.len());
+                filled.iter_mut().zip(whole).for_each(|(lanes, row)| lanes.0 = *row);
                 rest.fill(ZERO[0]);
+                if let Some(lanes) = rest.first_mut() {
+                    lanes.0[..part.len()].copy_from_slice(part);
+                }
             }
         }
     }

@@ -6,6 +6,9 @@
 use crate::panels::{LANES, Pair, Panels, WIDTH};
 use swm_simd::{CpuLevel, F32x16, Kernel, Level, dispatch};
 
+/// The number of terms of a segment that are added between two checks of bounds.
+const TERMS: usize = 16;
+
 /// A vector of the level `L`.
 type Vector<L> = <<L as Level>::F32x16 as F32x16>::Vector;
 
@@ -45,14 +48,15 @@ pub(crate) trait Operand: Copy {
     /// Whether the operand is transposed and the product is added to the previous result.
     const ADDS: bool;
 
-    /// Adds the terms of rows `row .. row + R` and of `W` vectors of a panel to `sums`.
+    /// Returns `sums` with the terms of rows `row .. row + R` and of `W` vectors of a panel. The sums are values, because the compiler
+    /// keeps what it has a reference to in memory wherever a check of bounds could panic.
     fn accumulate<L: Level, const R: usize, const W: usize>(
         self,
         row: usize,
         panel: &[Pair],
         first: usize,
-        sums: &mut [[Vector<L>; W]; R],
-    );
+        sums: [[Vector<L>; W]; R],
+    ) -> [[Vector<L>; W]; R];
 }
 
 /// The matrix `[rows, inputs]` whose rows are concatenations of segments.
@@ -95,22 +99,38 @@ impl<S: Starts> Operand for Rows<'_, S> {
         row: usize,
         panel: &[Pair],
         first: usize,
-        sums: &mut [[Vector<L>; W]; R],
-    ) {
+        mut sums: [[Vector<L>; W]; R],
+    ) -> [[Vector<L>; W]; R] {
         let starts: [usize; R] = std::array::from_fn(|r| self.starts.of(row + r));
         let mut later = panel;
         for segment in self.segments {
             let (now, rest) = later.split_at(segment.length);
             later = rest;
-            let rows: [&[f32]; R] =
-                std::array::from_fn(|r| &self.values[starts[r] + segment.offset..][..segment.length]);
-            for (p, pair) in now.iter().enumerate() {
+            let (blocks, last) = now.as_chunks::<TERMS>();
+            let mut rows: [(&[[f32; TERMS]], &[f32]); R] = [(&[], &[]); R];
+            for r in 0..R {
+                rows[r] = self.values[starts[r] + segment.offset..][..segment.length].as_chunks();
+            }
+            for (block, pairs) in blocks.iter().enumerate() {
+                let mut terms = [&[0.0; TERMS]; R];
+                for r in 0..R {
+                    terms[r] = &rows[r].0[block];
+                }
+                for p in 0..TERMS {
+                    let weights = load::<L, W>(&pairs[p], first);
+                    for r in 0..R {
+                        add_term::<L, W>(&mut sums[r], terms[r][p], &weights);
+                    }
+                }
+            }
+            for (p, pair) in last.iter().enumerate() {
                 let weights = load::<L, W>(pair, first);
                 for r in 0..R {
-                    add_term::<L, W>(&mut sums[r], rows[r][p], &weights);
+                    add_term::<L, W>(&mut sums[r], rows[r].1[p], &weights);
                 }
             }
         }
+        sums
     }
 }
 
@@ -123,8 +143,8 @@ impl<S: Starts> Operand for Columns<'_, S> {
         row: usize,
         panel: &[Pair],
         first: usize,
-        sums: &mut [[Vector<L>; W]; R],
-    ) {
+        mut sums: [[Vector<L>; W]; R],
+    ) -> [[Vector<L>; W]; R] {
         for (p, pair) in panel.iter().enumerate() {
             let weights = load::<L, W>(pair, first);
             let column = &self.values[self.starts.of(p) + row..][..R];
@@ -132,6 +152,7 @@ impl<S: Starts> Operand for Columns<'_, S> {
                 add_term::<L, W>(&mut sums[r], column[r], &weights);
             }
         }
+        sums
     }
 }
 
@@ -203,8 +224,8 @@ impl<X: Operand, S: Starts> Product<'_, X, S> {
             if first >= self.weights.outputs {
                 break;
             }
-            let mut sums = [load::<L, W>(panel.bias, half); R];
-            self.x.accumulate::<L, R, W>(row, panel.elements, half, &mut sums);
+            let sums = [load::<L, W>(panel.bias, half); R];
+            let sums = self.x.accumulate::<L, R, W>(row, panel.elements, half, sums);
             let width = (self.weights.outputs - first).min(W * LANES);
             for r in 0..R {
                 let to = &mut self.y.0[self.y.1.of(row + r) + first..][..width];

@@ -7,6 +7,8 @@ use pyo3::exceptions::PySystemExit;
 use pyo3::ffi::PyObject;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
+use std::cell::Cell;
+use std::marker::PhantomData;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::{self, ThreadId};
@@ -18,24 +20,31 @@ const PATIENCE: Duration = Duration::from_secs(5);
 
 /// The number of calls of the engine that run or that call Python.
 static CALLS: AtomicUsize = AtomicUsize::new(0);
+thread_local! {
+    /// Those of this thread.
+    static CALLS_HERE: Cell<usize> = const { Cell::new(0) };
+}
 /// The thread that ends the interpreter.
 static ENDED_BY: OnceLock<ThreadId> = OnceLock::new();
 
 /// A call of the engine, which the end of the interpreter waits for: where the engine calls Python while it has the GIL, or releases it.
+/// It ends in the thread in which it began.
 #[must_use = "the call ends when this is dropped"]
-pub struct Call;
+pub struct Call(PhantomData<*const ()>);
 
 impl Call {
     /// Begins a call.
     pub fn begin() -> Self {
         CALLS.fetch_add(1, Ordering::SeqCst);
-        Self
+        CALLS_HERE.set(CALLS_HERE.get() + 1);
+        Self(PhantomData)
     }
 }
 
 impl Drop for Call {
     fn drop(&mut self) {
         CALLS.fetch_sub(1, Ordering::SeqCst);
+        CALLS_HERE.set(CALLS_HERE.get() - 1);
     }
 }
 
@@ -79,6 +88,12 @@ pub fn end_calls(py: Python<'_>) {
             thread::sleep(Duration::from_millis(1));
         }
     });
+}
+
+/// Forgets the calls of other threads, which a forked process does not have. Python calls this function after a fork.
+#[pyfunction]
+pub fn forget_calls() {
+    CALLS.store(CALLS_HERE.get(), Ordering::SeqCst);
 }
 
 /// Stops the thread for ever when it is dropped.

@@ -46,13 +46,15 @@ mod _engine {
     #[pymodule_export]
     use super::data::replay::{ReplayBuffer, ReplaySampler};
     #[pymodule_export]
-    use super::data::tools::{check_replacement, convert, detect, doctor, find_dataset, inspect, recover, target};
+    use super::data::tools::{
+        check_replacement, convert, detect, doctor, find_dataset, has_no_dataset, inspect, recover, target,
+    };
     #[pymodule_export]
     use super::data::writer::Writer;
     #[pymodule_export]
     use super::env::NativeEnv;
     #[pymodule_export]
-    use super::exit::end_calls;
+    use super::exit::{end_calls, forget_calls};
     #[pymodule_export]
     use super::frames::{VisualWrappers, schedule, write_video};
     #[pymodule_export]

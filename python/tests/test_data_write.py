@@ -403,3 +403,25 @@ def test_ctrl_c_keeps_converted_episodes(tmp_path):
     assert output == "interrupted\n" and process.returncode == 0
     assert data.load_dataset(target).num_episodes == 2
     assert data.convert(tmp_path / "a.lance", target, progress=False)["kept"] == 2
+
+
+def test_refused_first_episode_defines_no_columns(tmp_path):
+    writer, buffer = data.open_writer(tmp_path / "a.lance"), data.ReplayBuffer(100)
+    with pytest.raises(ValueError):
+        writer.write_episode({"x": np.zeros((3, 0))})
+    with pytest.raises(ValueError):
+        buffer.write_episode({"y": np.zeros(500)})
+    for target in (writer, buffer):
+        target.write_episode({"x": np.arange(6.0)})
+    writer.close()
+    assert data.load_dataset(tmp_path / "a.lance").lengths.tolist() == [6]
+    assert buffer.lengths.tolist() == [6] and buffer.column_names == ["x"]
+
+
+def test_hdf5_file_whose_creation_was_killed_is_written_again(tmp_path):
+    path = tmp_path / "a.h5"
+    write(path, (5,))
+    # The signature is written last.
+    path.write_bytes(bytes(8) + path.read_bytes()[8:])
+    write(path, (6,))
+    assert data.load_dataset(path).lengths.tolist() == [6]

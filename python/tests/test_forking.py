@@ -4,11 +4,13 @@ import json
 import os
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
 
 from stable_worldmodel import World, data, policy
+from stable_worldmodel._lazy import lazy
 
 #: A Gymnasium environment, and one whose step uses another world, registered when their module is imported.
 COUNTING = """
@@ -209,3 +211,27 @@ def test_wrong_starts_and_factors_have_clear_errors(tmp_path):
             world.reset(seed=0, options={"variation_values": {"agent.speed": value}})
     with pytest.raises(ValueError, match=r"options\['state'\]: expected finite numbers"):
         world.reset(seed=0, options={"state": [float("nan")] * 4})
+
+
+def test_attributes_of_other_objects_do_not_wait():
+    class Slow:
+        @lazy
+        def value(self):
+            begun.set()
+            done.wait(30)
+            return 1
+
+    class Fast(Slow):
+        @lazy
+        def other(self):
+            return 2
+
+    begun, done = threading.Event(), threading.Event()
+    thread = threading.Thread(target=lambda: Slow().value)
+    thread.start()
+    begun.wait(30)
+    fast = Fast()
+    assert (fast.other, vars(fast)) == (2, {"other": 2}) and thread.is_alive()
+    done.set()
+    thread.join()
+    assert fast.value == 1

@@ -404,3 +404,30 @@ threading.Thread(target=play, daemon=True).start()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "thread ended\n", "")
+
+
+def test_forked_program_ends_silently_while_threads_play():
+    program = """
+import os, sys, threading, time
+import stable_worldmodel as swm
+
+def play():
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32))
+    world.set_policy(swm.policy.RandomPolicy())
+    while True:
+        world.collect(writer=swm.data.ReplayBuffer(1000), episodes=2, progress=False)
+
+def start():
+    for _ in range(3):
+        threading.Thread(target=play, daemon=True).start()
+    time.sleep(0.5)
+
+start()
+child = os.fork()
+if child:
+    assert os.waitpid(child, 0)[1] == 0
+else:
+    start()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")

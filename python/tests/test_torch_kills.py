@@ -38,19 +38,19 @@ def test_kills_while_a_checkpoint_is_written_are_continued(rooms, tmp_path):
     torch_train("gcbc", rooms, tmp_path / "whole", SHORT)
     # Between the two renamings: the old checkpoint, and a new one.
     Trainer(Options("gcbc", out=str(tmp_path / "swap"), **options)).train(until=2)
-    (tmp_path / "swap/checkpoint").rename(tmp_path / "swap/checkpoint.old")
-    shutil.copytree(tmp_path / "whole/checkpoint", tmp_path / "swap/checkpoint.new")
+    (tmp_path / "swap/checkpoint").rename(tmp_path / "swap/.checkpoint.old")
+    shutil.copytree(tmp_path / "whole/checkpoint", tmp_path / "swap/.checkpoint.new")
     assert load_pretrained(tmp_path / "swap").stored.config["seed"] == 0
     with pytest.raises(ValueError, match="resume=True"):
         torch_train("gcbc", rooms, tmp_path / "swap", SHORT)
     # While it writes the first one, which has no manifest.
     for name in ("first", "again"):
         (tmp_path / name).mkdir()
-        shutil.copytree(tmp_path / "whole/checkpoint", tmp_path / name / "checkpoint.new")
-        (tmp_path / name / "checkpoint.new/manifest.json").unlink()
+        shutil.copytree(tmp_path / "whole/checkpoint", tmp_path / name / ".checkpoint.new")
+        (tmp_path / name / ".checkpoint.new/manifest.json").unlink()
     # Files of the user with such names stay.
-    (tmp_path / "mine/checkpoint.new").mkdir(parents=True)
-    (tmp_path / "mine/checkpoint.new/weights.safetensors").write_text("mine")
+    (tmp_path / "mine/.checkpoint.new").mkdir(parents=True)
+    (tmp_path / "mine/.checkpoint.new/weights.safetensors").write_text("mine")
     with pytest.raises(ValueError, match="move them away"):
         torch_train("gcbc", rooms, tmp_path / "mine", SHORT)
     for name, resume in (("swap", True), ("first", True), ("again", False)):

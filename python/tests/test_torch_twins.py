@@ -163,6 +163,15 @@ def test_saving_replaces_nothing_unasked_and_refuses_other_weights(rooms, tmp_pa
         module.save_pretrained(tmp_path / "run")
     hash = module.save_pretrained(tmp_path / "run", overwrite=True)
     assert hash == swm.wm.load(str(tmp_path / "run")).card["weights"]
+    foreign = tmp_path / "foreign/checkpoint/config.json"
+    foreign.parent.mkdir(parents=True)
+    foreign.write_text('{"model_type": "bert"}')
+    with pytest.raises(ValueError, match="none of this program"):
+        module.save_pretrained(tmp_path / "foreign", overwrite=True)
+    assert foreign.read_text() == '{"model_type": "bert"}' and list(foreign.parent.iterdir()) == [foreign]
+    for path in ("s3://bucket/model", ""):
+        with pytest.raises(ValueError, match="a local folder"):
+            module.save_pretrained(path)
     with torch.no_grad():
         module.projector.net[0].bias[0] = float("inf")
     with pytest.raises(ValueError, match="not finite"):

@@ -7,11 +7,12 @@ use swm_core::{Error, Result};
 use swm_data::FORMATS;
 
 /// The folder of the checkpoint inside the folder of a run.
-pub(crate) const FOLDER: &str = "checkpoint";
-/// The folder in which a checkpoint is written before it replaces [`FOLDER`].
-pub(crate) const NEW_FOLDER: &str = "checkpoint.new";
+pub const FOLDER: &str = "checkpoint";
+/// The folder in which a checkpoint is written before it replaces [`FOLDER`]. Hidden, as the next one, because users keep copies in
+/// folders such as `checkpoint.old`.
+pub const NEW_FOLDER: &str = ".checkpoint.new";
 /// The folder of the checkpoint that [`FOLDER`] replaces, until it is deleted.
-pub(crate) const OLD_FOLDER: &str = "checkpoint.old";
+pub const OLD_FOLDER: &str = ".checkpoint.old";
 /// Family, configuration and statistics of the dataset.
 pub(crate) const CONFIG: &str = "config.json";
 /// Provenance, and the hashes of the other files.
@@ -62,14 +63,14 @@ const LOG_FILES: &[&str] = &["run.json", ".run.json.*.tmp", "train.jsonl", "even
 const CHECKPOINT_FOLDERS: &[&str] = &[
     "",
     "checkpoint/",
-    "checkpoint.new/",
-    "checkpoint.old/",
+    ".checkpoint.new/",
+    ".checkpoint.old/",
     "best/checkpoint/",
-    "best/checkpoint.new/",
-    "best/checkpoint.old/",
+    "best/.checkpoint.new/",
+    "best/.checkpoint.old/",
     "world/checkpoint/",
-    "world/checkpoint.new/",
-    "world/checkpoint.old/",
+    "world/.checkpoint.new/",
+    "world/.checkpoint.old/",
 ];
 
 /// The folders with the data of an online run in the folder of a run, sorted.

@@ -4,7 +4,7 @@ use crate::checkpoint::{check_unused, write};
 use crate::nn::parameters::{HostTensor, Named};
 use crate::registry::{FAMILIES, load_stored};
 use crate::run_folder::{OPTIMIZER, RAW, STATE};
-use crate::stored::StoredCheckpoint;
+use crate::stored::{StoredCheckpoint, check_replaceable};
 use crate::tensor_file;
 use crate::train::run_state::RunState;
 use burn::tensor::Device;
@@ -38,8 +38,8 @@ pub struct StateParts {
 /// a checkpoint only if `replace` is set.
 ///
 /// # Errors
-/// When the parts are not those of a checkpoint that this program can load, as [`check_unused`] without `replace`, or when
-/// writing fails; an earlier checkpoint is kept.
+/// When the parts are not those of a checkpoint that this program can load, as [`check_unused`] without `replace`, when what would be
+/// replaced is no checkpoint of this program, or when writing fails; an earlier checkpoint is kept.
 pub fn store(run: &Path, parts: Parts, replace: bool) -> Result<String> {
     let Parts { file, mut manifest, weights, state } = parts;
     let invalid = |problem: String| {
@@ -50,7 +50,9 @@ pub fn store(run: &Path, parts: Parts, replace: bool) -> Result<String> {
     }
     let stored = StoredCheckpoint::of_parts(run, file.clone(), manifest.clone(), weights.clone());
     load_stored(FAMILIES.rows, &stored, &Device::flex())?;
-    if !replace {
+    if replace {
+        check_replaceable(run)?;
+    } else {
         check_unused(run)?;
     }
     let mut additional = vec![];

@@ -3,7 +3,9 @@
 use crate::capsule::Capsule;
 use crate::nn::Init;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::run_folder::{CONFIG, FOLDER, MANIFEST, NEW_FOLDER, OPTIMIZER, PLAYED, RAW, WEIGHTS, WORLD_MODEL};
+use crate::run_folder::{
+    CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, NEW_FOLDER, OLD_FOLDER, OPTIMIZER, PLAYED, RAW, WEIGHTS, WORLD_MODEL,
+};
 use crate::train::limits;
 use crate::{tensor_file, weights};
 use burn::module::Module;
@@ -221,13 +223,37 @@ pub fn check_unused(run: &Path) -> Result<()> {
     }
     names.sort();
     let is_used = |name: &&String| {
-        let fixed = [CONFIG, FOLDER, NEW_FOLDER, "checkpoint.old", "train.jsonl", "best", WORLD_MODEL];
+        let fixed = [CONFIG, FOLDER, NEW_FOLDER, OLD_FOLDER, "train.jsonl", "best", WORLD_MODEL];
         fixed.contains(&name.as_str()) || name.starts_with(PLAYED) || is_event_file(name)
     };
     let Some(name) = names.iter().find(is_used) else { return Ok(()) };
     let problem = format!("holds a checkpoint already, or files with such names: '{name}' exists");
     let fix = "choose another folder, or `swm checkpoints remove` a checkpoint";
     Err(Error::config(run.display().to_string(), problem, fix))
+}
+
+/// Checks that a folder that a checkpoint replaces has files of a checkpoint only beside the configuration of one.
+///
+/// # Errors
+/// When it has such files of another program.
+pub(crate) fn check_replaceable(run: &Path) -> Result<()> {
+    for folder in [FOLDER, NEW_FOLDER, OLD_FOLDER].map(|folder| run.join(folder)) {
+        if is_occupied(&folder) && !is_begun(&folder) {
+            let problem = "has files with the names of a checkpoint, and is none of this program";
+            let fix = "move them away, or choose another folder";
+            return Err(Error::config(folder.display().to_string(), problem, fix));
+        }
+    }
+    Ok(())
+}
+
+/// Returns whether a path is a file or a link, or a folder with a file that a checkpoint would replace.
+pub(crate) fn is_occupied(folder: &Path) -> bool {
+    match std::fs::symlink_metadata(folder) {
+        Err(_) => false,
+        Ok(found) if !found.is_dir() => true,
+        Ok(_) => CHECKPOINT_FILES.iter().any(|name| std::fs::symlink_metadata(folder.join(name)).is_ok()),
+    }
 }
 
 /// Returns whether a file name is that of a TensorBoard event file of this program.
@@ -289,9 +315,7 @@ pub(crate) fn with_weights<M: Module>(model: M, weights: &Named<HostTensor>, pat
 /// Returns the folder of a run's checkpoint: `run`, the folder `checkpoint` in `run`, or the old checkpoint, which
 /// remains if a process was killed between the two renamings.
 pub(crate) fn locate(run: &Path) -> Option<PathBuf> {
-    [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
-        .into_iter()
-        .find(|folder| folder.join(CONFIG).is_file())
+    [run.to_owned(), run.join(FOLDER), run.join(OLD_FOLDER)].into_iter().find(|folder| folder.join(CONFIG).is_file())
 }
 
 /// Reads a JSON file of a checkpoint.

@@ -9,6 +9,7 @@ use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Value, json as value};
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm::core::run::{Control, Event};
 use swm::core::{Error, Named as _};
@@ -152,6 +153,12 @@ pub fn inspect(py: Python<'_>, dataset: &Dataset, with_checksum: bool) -> PyResu
 pub fn detect(path: &str) -> PyResult<Option<&'static str>> {
     let location = Location::parse(path).map_err(to_py_err)?;
     Ok(formats::detect(&location).map(|format| format.id()))
+}
+
+/// Whether an existing path holds no dataset yet: an empty folder, or what a writer leaves that was killed.
+#[pyfunction]
+pub fn has_no_dataset(path: PathBuf) -> bool {
+    formats::has_no_dataset(&path)
 }
 
 /// Raises an error if the dataset at a path is being replaced, or that was interrupted.

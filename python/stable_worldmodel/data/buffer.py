@@ -181,6 +181,7 @@ class ReplayBuffer(Dataset):
         if not arrays:
             return
         with self._lock:
+            before = self._columns, self._buffer
             if self._buffer is None:
                 self._columns = [(name, array.dtype.name, list(array.shape[1:])) for name, array in arrays.items()]
                 self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
@@ -188,7 +189,12 @@ class ReplayBuffer(Dataset):
             extra = [name for name in arrays if name not in {name for name, _, _ in self._columns}]
             if missing or extra:
                 raise ValueError(f"an episode must have the buffer's columns: missing {missing}, unexpected {extra}")
-            self._buffer.add({name: arrays[name] for name, _, _ in self._columns}, constants)
+            try:
+                self._buffer.add({name: arrays[name] for name, _, _ in self._columns}, constants)
+            except BaseException:
+                # A refused episode defines no columns.
+                self._columns, self._buffer = before
+                raise
             self._refresh()
 
     def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:

@@ -79,7 +79,7 @@ class EpisodeWriter:
         #: The columns and their types, once they are known.
         self._columns: dict[str, tuple[str, tuple[int, ...]]] = {}
         location = Path(self.path)
-        exists = "://" not in self.path and location.exists() and not (location.is_dir() and not any(location.iterdir()))
+        exists = "://" not in self.path and location.exists() and not _engine.has_no_dataset(self.path)
         if exists and mode == "error":
             raise FileExistsError(
                 f"{self.path}: there is a dataset already; continue it (mode='append') or replace it (mode='overwrite')"
@@ -126,12 +126,18 @@ class EpisodeWriter:
             if _tensors.without_last_action(arrays) and not self._warned:
                 self._warned = True
                 warnings.warn(f"{self.path}: {_tensors.LAST_ACTION}", stacklevel=2)
-            if not self._columns:
+            known = self._columns
+            if not known:
                 self._columns = {name: (array.dtype.name, array.shape[1:]) for name, array in arrays.items()}
-            fitted = self._fitted(arrays)
-            if self._writer is None:
-                columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
-                self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
+            try:
+                fitted = self._fitted(arrays)
+                if self._writer is None:
+                    columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
+                    self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
+            except BaseException:
+                # A refused episode defines no columns.
+                self._columns = known
+                raise
             try:
                 self._writer.write(fitted, constants)
             except BaseException:

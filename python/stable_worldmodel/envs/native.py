@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -12,6 +11,7 @@ import numpy as np
 
 from .. import _engine, _options
 from .. import spaces as swm_spaces
+from .._lazy import lazy
 
 __all__ = ["NativeEnv"]
 
@@ -80,7 +80,7 @@ class NativeEnv(gymnasium.Env):
         """Steps after which `swm.World` truncates an episode. In Gymnasium, `make(…, max_episode_steps=…)` sets one."""
         return int(self._described["max_episode_steps"])
 
-    @cached_property
+    @lazy
     def _variation_space(self) -> swm_spaces.Dict:
         return swm_spaces.variation_space(self._described["variation"], self._described["sampling_order"])
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from .. import _engine
+from .._files import CHECKPOINT_FOLDERS
 from ._weights import load_into, read_capsule, read_safetensors
 from .encoders import encoder_of
 from .frames import Frames
@@ -92,7 +93,7 @@ def is_stored(path: Path) -> bool:
 
 def _folder_of(path: Path) -> Path | None:
     """The folder of a run that holds the checkpoint."""
-    folders = (path, path / "checkpoint", path / "checkpoint.old")
+    folders = (path, *(path / name for name in CHECKPOINT_FOLDERS))
     return next((folder for folder in folders if (folder / "weights.safetensors").is_file()), None)
 
 

@@ -122,6 +122,8 @@ class Pretrained(nn.Module):
 def run_path(name: str | os.PathLike[str]) -> Path:
     """The folder of a checkpoint to write: a path, or a name under `$STABLEWM_HOME/checkpoints`."""
     path = Path(name)
+    if "://" in str(name) or not path.name:
+        raise ValueError(f"path: expected a name or a local folder for the checkpoint, got {str(name)!r}")
     if path.is_absolute() or len(path.parts) > 1 or str(name).startswith("."):
         return path
     return Path(_engine.home()) / "checkpoints" / path

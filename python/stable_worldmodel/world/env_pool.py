@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from .. import spaces as swm_spaces
+from .._lazy import lazy
 from ..data import _tensors
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class EnvPool:
         space: spaces.Space[Any] = self.envs[0].action_space
         return space
 
-    @cached_property
+    @lazy
     def action_space(self) -> spaces.Space[Any]:
         """The action space of all environments together."""
         return batch_space(self.single_action_space, self.num_envs)
@@ -66,7 +66,7 @@ class EnvPool:
         space: spaces.Space[Any] = self.envs[0].observation_space
         return space
 
-    @cached_property
+    @lazy
     def observation_space(self) -> spaces.Space[Any]:
         """The observation space of all environments together."""
         return batch_space(self.single_observation_space, self.num_envs)
@@ -206,27 +206,27 @@ class WorldEnvs(EnvPool):
         """The number of environments."""
         return self._world.num_envs
 
-    @cached_property
+    @lazy
     def single_action_space(self) -> spaces.Space[Any]:
         """The action space of one environment."""
         return swm_spaces.from_description(self._world.spec["action_space"])
 
-    @cached_property
+    @lazy
     def action_space(self) -> spaces.Space[Any]:
         """The action space of all environments together."""
         return batch_space(self.single_action_space, self.num_envs)
 
-    @cached_property
+    @lazy
     def single_observation_space(self) -> spaces.Space[Any]:
         """The observation space of one environment."""
         return swm_spaces.from_description(self._world.spec["observation_space"])
 
-    @cached_property
+    @lazy
     def observation_space(self) -> spaces.Space[Any]:
         """The observation space of all environments together."""
         return batch_space(self.single_observation_space, self.num_envs)
 
-    @cached_property
+    @lazy
     def variation_space(self) -> swm_spaces.Dict:
         """The factors of variation."""
         return swm_spaces.variation_space(self._world.spec["variation"], self._world.spec["sampling_order"])

@@ -9,7 +9,6 @@ import secrets
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from gymnasium import spaces
 
 from .. import _engine, _files, _options, _progress
 from .. import spaces as swm_spaces
+from .._lazy import lazy
 from ..wrapper.visual import engine_wrappers
 from .env_pool import WorldEnvs
 from .metrics import Metrics
@@ -172,7 +172,7 @@ class World:
 
     # Properties.
 
-    @cached_property
+    @lazy
     def spec(self) -> dict[str, Any]:
         """The specification of the environments: spaces, info columns, factors."""
         return dict(json.loads(self._world.spec()))

@@ -1,8 +1,8 @@
 //! Checks that a stored run can be continued with a given configuration and dataset, and that a new run
 //! replaces nothing that no run wrote.
 
-use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, NEW_FOLDER};
-use crate::stored::{is_begun, is_event_file, locate};
+use crate::run_folder::{CONFIG, FOLDER, NEW_FOLDER, OLD_FOLDER};
+use crate::stored::{is_begun, is_event_file, is_occupied, locate};
 use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;
@@ -39,12 +39,12 @@ pub(crate) fn check_new_run(out: &Path) -> Result<()> {
     }
     let current = out.join(FOLDER);
     let mut foreign = is_occupied(&current) && !current.join(CONFIG).is_file();
-    foreign |= locate(out).is_none() && is_occupied(&out.join("checkpoint.old"));
+    foreign |= locate(out).is_none() && is_occupied(&out.join(OLD_FOLDER));
     // A training outside this program writes no event file, and its first checkpoint before any log.
     let is_foreign = |place: &Path| !has_events && is_occupied(place) && !is_begun(place);
     foreign |= is_foreign(&out.join(NEW_FOLDER));
     for inner in ["best", "world"] {
-        let mut places = ["", ".new", ".old"].map(|end| out.join(inner).join(format!("{FOLDER}{end}"))).into_iter();
+        let mut places = [FOLDER, NEW_FOLDER, OLD_FOLDER].map(|folder| out.join(inner).join(folder)).into_iter();
         foreign |=
             places.any(|place| is_foreign(&place) || (is_occupied(&place) && !has_events && locate(out).is_none()));
     }
@@ -53,15 +53,6 @@ pub(crate) fn check_new_run(out: &Path) -> Result<()> {
         return Err(Error::config(out.display().to_string(), problem, "move them away, or choose another folder"));
     }
     Ok(())
-}
-
-/// Returns whether a path is a file or a link, or a folder with a file that a checkpoint would replace.
-fn is_occupied(folder: &Path) -> bool {
-    match std::fs::symlink_metadata(folder) {
-        Err(_) => false,
-        Ok(found) if !found.is_dir() => true,
-        Ok(_) => CHECKPOINT_FILES.iter().any(|name| std::fs::symlink_metadata(folder.join(name)).is_ok()),
-    }
 }
 
 /// Returns whether a file is empty, or is the log of a run, whose last line a kill may have cut off.

@@ -51,8 +51,8 @@ fn damaged_checkpoints_are_refused() {
     assert!(message(&trained).contains("config.json") && message(&trained).contains("the hash differs"));
     std::fs::write(&config_file, &original).expect("writing the file");
 
-    // If a process is killed between the two renames of a save, the folder `checkpoint.old` remains.
-    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("renaming the folder");
+    // If a process is killed between the two renames of a save, the folder `.checkpoint.old` remains.
+    std::fs::rename(&inner, trained.join(".checkpoint.old")).expect("renaming the folder");
     load(&trained).expect("loading the old checkpoint");
 }
 

@@ -5,12 +5,12 @@ use serde_json::Value;
 use std::path::Path;
 use swm_core::{Error, Result, files};
 use swm_models::StoredCheckpoint;
+use swm_models::run_folder::{FOLDER, NEW_FOLDER, OLD_FOLDER};
 
 /// The largest state of a run that is read.
 const MAX_STATE: u64 = 1 << 24;
 /// What a training writes to the folder of a run, beside the data of an online run.
-const NAMES: &[&str] =
-    &["checkpoint", "checkpoint.new", "checkpoint.old", "best", "world", "train.jsonl", "failed-batch.safetensors"];
+const NAMES: &[&str] = &[FOLDER, NEW_FOLDER, OLD_FOLDER, "best", "world", "train.jsonl", "failed-batch.safetensors"];
 /// The start of the names of folders with the data of an online run.
 const PLAYED: &str = "played-";
 
@@ -51,7 +51,7 @@ pub fn check_unfinished(run: &Path, library: &str) -> Result<()> {
     else {
         return Ok(());
     };
-    let states = ["checkpoint", "checkpoint.old"].map(|folder| run.join(folder).join("state.json"));
+    let states = [FOLDER, OLD_FOLDER].map(|folder| run.join(folder).join("state.json"));
     let state = states.iter().find_map(|path| files::read(path, MAX_STATE).ok());
     let state: Value = state.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default();
     let (Some(done), Some(steps)) = (state["step"].as_u64(), manifest.config["schedule"]["steps"].as_u64()) else {

@@ -85,8 +85,8 @@ fn training_does_not_write_through_links() {
     swm.json(DEMO);
     let (thesis, run) = (swm.path("thesis.txt"), swm.path("linked"));
     user_file(&thesis);
-    fs::create_dir_all(run.join("checkpoint.new")).expect("creating folders");
-    for name in ["checkpoint.new/config.json", "checkpoint.new/weights.safetensors"] {
+    fs::create_dir_all(run.join(".checkpoint.new")).expect("creating folders");
+    for name in [".checkpoint.new/config.json", ".checkpoint.new/weights.safetensors"] {
         std::os::unix::fs::symlink(&thesis, run.join(name)).expect("making a link");
     }
     // An event file marks the folder of a run that was killed.
@@ -105,7 +105,7 @@ fn training_does_not_write_through_links() {
     std::os::unix::fs::symlink(swm.path("disk"), run.join("checkpoint")).expect("making a link");
     let before = fs::read(run.join("run.json")).expect("the record");
     swm.fails(&["train", "-o", "./linked", "--resume"], 2, &["checkpoint", "symbolic link", "in its place"]);
-    assert!(fs::read(run.join("run.json")).is_ok_and(|after| after == before) && !run.join("checkpoint.old").exists());
+    assert!(fs::read(run.join("run.json")).is_ok_and(|after| after == before) && !run.join(".checkpoint.old").exists());
 }
 
 #[test]
@@ -287,8 +287,8 @@ fn training_does_not_replace_files_of_the_user() {
     for place in [
         "a/train.jsonl",
         "b/checkpoint/weights.safetensors",
-        "c/checkpoint.old/state.json",
-        "d/checkpoint.new/manifest.json",
+        "c/.checkpoint.old/state.json",
+        "d/.checkpoint.new/manifest.json",
         "e/best/checkpoint/weights.safetensors",
         "f/checkpoint",
     ] {
@@ -302,11 +302,15 @@ fn training_does_not_replace_files_of_the_user() {
 
     // What a run leaves that was killed while it wrote its first checkpoint is replaced.
     swm.json(&train("./killed"));
-    let (whole, new) = (swm.path("killed/checkpoint"), swm.path("killed/checkpoint.new"));
+    let (whole, new) = (swm.path("killed/checkpoint"), swm.path("killed/.checkpoint.new"));
     fs::rename(&whole, &new).expect("renaming the checkpoint");
     fs::remove_file(new.join("manifest.json")).expect("removing a file of the checkpoint");
+    // Copies of a checkpoint that the user made stay.
+    let copies = ["killed/checkpoint.old/weights.safetensors", "killed/checkpoint.new/config.json"].map(|file| swm.path(file));
+    copies.iter().for_each(|file| user_file(file));
     swm.json(&train("./killed"));
     assert!(whole.join("manifest.json").is_file() && !new.exists());
+    copies.iter().for_each(|file| assert_untouched(file));
 }
 
 #[test]
@@ -319,8 +323,8 @@ fn export_replaces_nothing() {
     for place in [
         "a/checkpoint/weights.safetensors",
         "b/checkpoint/config.json",
-        "c/checkpoint.old/config.json",
-        "d/checkpoint.new/config.json",
+        "c/.checkpoint.old/config.json",
+        "d/.checkpoint.new/config.json",
         "e/checkpoint",
         "f/train.jsonl",
     ] {
@@ -363,7 +367,7 @@ fn unfinished_exports_leave_nothing_or_can_be_removed() {
 
     // What a kill leaves.
     swm.json(&["checkpoints", "export", "zoo:two-room/pldm", "killed"]);
-    let new = swm.path("killed/checkpoint.new");
+    let new = swm.path("killed/.checkpoint.new");
     fs::rename(swm.path("killed/checkpoint"), &new).expect("renaming the checkpoint");
     fs::remove_file(new.join("manifest.json")).expect("removing a file");
     fs::rename(new.join("weights.safetensors"), new.join(".weights.safetensors.7.tmp")).expect("renaming a file");
@@ -372,6 +376,6 @@ fn unfinished_exports_leave_nothing_or_can_be_removed() {
     assert_untouched(&new.join("thesis.txt"));
     assert_eq!(fs::read_dir(&new).expect("listing the folder").count(), 1);
     // Another folder of that name is no checkpoint.
-    user_file(&swm.path("mine/checkpoint.new/config.json"));
+    user_file(&swm.path("mine/.checkpoint.new/config.json"));
     swm.fails(&["checkpoints", "remove", "./mine", "--yes"], 1, &["not a checkpoint"]);
 }

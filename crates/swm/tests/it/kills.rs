@@ -86,7 +86,7 @@ fn fifty_killed_trainings_resume() {
     for moment in 0..KILLS {
         let stored = swm.path("checkpoints/small").exists();
         kill(&swm, if stored { &resume } else { &begin }, longest, moment);
-        if swm.path("checkpoints/small/checkpoint").exists() || swm.path("checkpoints/small/checkpoint.old").exists() {
+        if swm.path("checkpoints/small/checkpoint").exists() || swm.path("checkpoints/small/.checkpoint.old").exists() {
             swm.json(&["checkpoints", "verify", "small"]);
         }
     }

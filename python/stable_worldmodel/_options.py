@@ -134,7 +134,9 @@ def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[st
 
 def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> str:
     """All options of a reset, as JSON."""
-    options = options or {}
+    options = {} if options is None else options
+    if not isinstance(options, Mapping):
+        raise TypeError(f"options: expected a dict such as {{'variation': ['all']}}, or None, got {options!r}")
     given = {
         name: None if options.get(name) is None else _numbers(f"options[{name!r}]", options[name]).tolist()
         for name in ("state", "goal_state")

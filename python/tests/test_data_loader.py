@@ -121,6 +121,9 @@ def test_saved_position_continues_with_the_same_batches(stored):
     assert identities(stopped) == epochs[1]
     with pytest.raises(ValueError, match="seed was 5 and is 6"):
         loader(path, seed=6).load_state_dict(complete.state_dict())
+    for other in ({}, None):
+        with pytest.raises(ValueError, match="expected what state_dict returned"):
+            complete.load_state_dict(other)
     for wrong, error in (({"batch": 2.9}, TypeError), ({"batch": 10**9}, ValueError), ({"epoch": -1}, ValueError)):
         with pytest.raises(error):
             complete.load_state_dict({**complete.state_dict(), **wrong})

@@ -216,6 +216,8 @@ def test_invalid_episodes_are_rejected_and_valid_ones_stored(tmp_path):
 
 
 def test_lossless_codecs_are_exact(tmp_path):
+    with pytest.raises(TypeError, match="codec: expected"):
+        data.open_writer(tmp_path / "a.lance", codec=5)
     sizes = {}
     for codec in (None, "qoi", "png", "jpeg", "jpeg-20"):
         path = tmp_path / f"{codec}.lance"

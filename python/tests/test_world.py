@@ -469,6 +469,13 @@ def test_changed_snapshots_are_refused():
     world.step()
 
 
+def test_options_of_a_reset_are_dicts():
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False)
+    for options in (5, ["all", None]):
+        with pytest.raises(TypeError, match="options: expected a dict"):
+            world.reset(options=options)
+
+
 @pytest.mark.parametrize("index", [-1, 2, 2**70])
 def test_indices_of_no_environment_are_refused(index):
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16))

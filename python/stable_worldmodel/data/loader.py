@@ -245,6 +245,8 @@ class Loader:
     def load_state_dict(self, state: Mapping[str, int]) -> None:
         """Continues at a saved position: the next batches equal the batches that followed the position."""
         own = self.state_dict()
+        if not isinstance(state, Mapping) or any(name not in state for name in own):
+            raise ValueError(f"state: expected what state_dict returned, with the keys {', '.join(own)}, got {state!r}")
         changed = {name: (state[name], own[name]) for name in ("seed", "batch_size", "clips") if state[name] != own[name]}
         if changed:
             changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in changed.items())

@@ -27,6 +27,8 @@ def codec_json(codec: str | None, quality: int | None = None) -> str | None:
         if quality is None:
             return None
         codec = "jpeg"
+    if not isinstance(codec, str):
+        raise TypeError(f"codec: expected 'qoi', 'png' or 'jpeg-QUALITY', got {codec!r}")
     name, _, given = codec.lower().replace(":", "-").partition("-")
     name = {"lossless": "qoi", "jpg": "jpeg"}.get(name, name)
     if name == "jpeg" and (not given or given.isdigit()):

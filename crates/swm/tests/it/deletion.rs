@@ -306,7 +306,8 @@ fn training_does_not_replace_files_of_the_user() {
     fs::rename(&whole, &new).expect("renaming the checkpoint");
     fs::remove_file(new.join("manifest.json")).expect("removing a file of the checkpoint");
     // Copies of a checkpoint that the user made stay.
-    let copies = ["killed/checkpoint.old/weights.safetensors", "killed/checkpoint.new/config.json"].map(|file| swm.path(file));
+    let copies =
+        ["killed/checkpoint.old/weights.safetensors", "killed/checkpoint.new/config.json"].map(|file| swm.path(file));
     copies.iter().for_each(|file| user_file(file));
     swm.json(&train("./killed"));
     assert!(whole.join("manifest.json").is_file() && !new.exists());

@@ -102,7 +102,7 @@ pub fn solve<'py>(
         })
     } else {
         let mut cost = PythonCost::new(model)?;
-        exit::call_method(&model, "observe", (infos,))?;
+        exit::call_method(model, "observe", (infos,))?;
         cost.observed(envs);
         exit::detached(py, || {
             control.on_this_thread(|interrupt| {

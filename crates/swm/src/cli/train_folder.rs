@@ -83,7 +83,7 @@ mod tests {
         fs::create_dir(&other).expect("creating a folder");
         symlink(&other, run.join("notes")).expect("making a link");
         check_links(&run).expect("a link of the user");
-        for name in ["checkpoint", "run.json", "train.jsonl", "played-20", "best/checkpoint.new"] {
+        for name in ["checkpoint", "run.json", "train.jsonl", "played-20", "best/.checkpoint.new"] {
             symlink(&other, run.join(name)).expect("making a link");
             let error = check_links(&run).expect_err(name).to_string();
             assert!(error.contains(name) && error.contains("symbolic link"), "{error}");

@@ -4,6 +4,7 @@
 use crate::arrays;
 use crate::errors::{attached, to_py_err};
 use crate::exit;
+use crate::held::Held;
 use crate::model::Model;
 use numpy::{IxDyn, PyArrayDyn, PyArrayMethods as _, PyUntypedArrayMethods as _};
 use pyo3::ffi;
@@ -61,7 +62,7 @@ pub fn planning_model(
 pub struct PythonCost {
     /// Has the methods `observe(infos)` and `cost(candidates)`, and depending on its flags `cost_and_gradient`,
     /// `encode`, `predict`, `predict_vjp`, `constrain` and `constrain_vjp`. All methods take and return numpy arrays.
-    adapter: Py<PyAny>,
+    adapter: Held<Py<PyAny>>,
     gradient: bool,
     /// The latent dimension; `None` if the model has no latent dynamics.
     latent: Option<usize>,
@@ -84,7 +85,7 @@ impl PythonCost {
             gradient: adapter.getattr("has_gradient")?.extract()?,
             latent: adapter.getattr("latent_dim")?.extract()?,
             constrained: adapter.getattr("has_constraints")?.extract()?,
-            adapter: adapter.clone().unbind(),
+            adapter: Held::new(adapter.clone().unbind()),
             envs: 0,
             buffers: RefCell::default(),
             failed: RefCell::new(None),
@@ -108,7 +109,7 @@ impl PythonCost {
 /// Arrays that are filled again as soon as nothing in Python refers to them, because new memory of their size costs page faults: more
 /// than the copy.
 #[derive(Default)]
-struct Buffers(Vec<Py<PyArrayDyn<f32>>>);
+struct Buffers(Vec<Held<Py<PyArrayDyn<f32>>>>);
 
 impl Buffers {
     /// The most arrays: that of the present call, one that the last call left, and a spare one.
@@ -118,7 +119,7 @@ impl Buffers {
     fn filled<'py>(&mut self, py: Python<'py>, given: Candidates<'_>) -> PyResult<Bound<'py, PyAny>> {
         let shape = [given.envs, given.samples, given.horizon, given.dim];
         // Tensors and views refer to the array that owns the memory, which is one of these.
-        let is_free = |array: &Py<PyArrayDyn<f32>>| {
+        let is_free = |array: &Held<Py<PyArrayDyn<f32>>>| {
             // SAFETY: the pointer is that of a living object, and this thread is attached to the interpreter.
             #[allow(unsafe_code, reason = "PyO3 has no other way to count references")]
             let references = unsafe { ffi::Py_REFCNT(array.as_ptr()) };
@@ -137,7 +138,7 @@ impl Buffers {
         if self.0.len() == Self::MOST {
             self.0.remove(0);
         }
-        self.0.push(array.clone().unbind());
+        self.0.push(Held::new(array.clone().unbind()));
         Ok(array.into_any())
     }
 }

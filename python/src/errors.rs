@@ -1,6 +1,7 @@
 //! Conversion between engine errors and Python exceptions; Python's signals and progress in the engine's loops.
 
 use crate::exit::{self, is_over};
+use crate::held::Held;
 use pyo3::exceptions::{PyFileNotFoundError, PyKeyboardInterrupt, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -14,8 +15,8 @@ pub fn to_py_err(error: Error) -> PyErr {
     // Names in files of strangers could control a terminal.
     let message = printable(&error.to_string()).into_owned();
     match error {
-        Error::Embedder(inner) => match inner.downcast::<PyErr>() {
-            Ok(original) => *original,
+        Error::Embedder(inner) => match inner.downcast::<Held<PyErr>>() {
+            Ok(original) => original.into_inner(),
             Err(_) => PyRuntimeError::new_err(message),
         },
         Error::Interrupted => PyKeyboardInterrupt::new_err(message),
@@ -32,7 +33,7 @@ pub fn to_py_err(error: Error) -> PyErr {
 
 /// Wraps a Python exception in an engine error, so that [`to_py_err`] can return it unchanged.
 pub fn from_py_err(error: PyErr) -> Error {
-    Error::Embedder(Box::new(error))
+    Error::Embedder(Box::new(Held::new(error)))
 }
 
 /// Runs `work` in Python, for a thread of the engine. While the interpreter shuts down, there is nothing to call, and the thread is told
@@ -77,10 +78,10 @@ pub fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let mut poll = signal_poll();
     let control =
         Control::new().with_poll(move || match failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            Some(error) => Err(from_py_err(error)),
+            Some(error) => Err(error),
             None => poll(),
         });
-    let Some(call) = progress else { return control };
+    let Some(call) = progress.map(Held::new) else { return control };
     let mut last: Option<Instant> = None;
     control.with_events(move |event| {
         let Event::Progress(at) = event else { return };
@@ -91,6 +92,7 @@ pub fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
         let steps = at.metric("steps").unwrap_or_default() as usize;
         let outcome = Python::try_attach(|py| exit::call(call.bind(py), (at.done, at.total, steps)).map(drop));
         if let Some(Err(error)) = outcome {
+            let error = from_py_err(error);
             callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }
     })

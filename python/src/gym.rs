@@ -2,6 +2,7 @@
 
 use crate::errors::from_py_err;
 use crate::exit::{self, is_over};
+use crate::held::Held;
 use pyo3::prelude::*;
 use pyo3::types::{PyByteArray, PyBytes, PyModule};
 use std::cell::Cell;
@@ -11,8 +12,8 @@ use swm::gym::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport};
 /// A [`Transport`] to an environment in this interpreter.
 pub struct InProcess {
     /// A callable without arguments that creates the environment and returns its `Bridge`.
-    make: Py<PyAny>,
-    bridge: Option<Py<PyAny>>,
+    make: Held<Py<PyAny>>,
+    bridge: Option<Held<Py<PyAny>>>,
     /// The memory that the bridge reads and writes. The bridge's memory views prevent a resize.
     memory: Option<Memory>,
 }
@@ -20,7 +21,7 @@ pub struct InProcess {
 impl InProcess {
     /// Creates a transport to the environment that `make` creates.
     pub fn new(make: Py<PyAny>) -> Self {
-        Self { make, bridge: None, memory: None }
+        Self { make: Held::new(make), bridge: None, memory: None }
     }
 }
 
@@ -56,7 +57,7 @@ struct Memory {
     /// The address of the first byte.
     address: usize,
     size: usize,
-    _owner: Py<PyByteArray>,
+    _owner: Held<Py<PyByteArray>>,
 }
 
 /// Converts a Python exception to a failure that is not retried, because a retry would raise the exception again.
@@ -84,9 +85,9 @@ impl Transport for InProcess {
             let description = Description::parse(&text).map_err(Failure::Refused)?;
             let memory = PyByteArray::new(py, &vec![0; description.size]);
             exit::call_method(&bridge, "attach", (&memory,)).map_err(refused)?;
-            self.bridge = Some(bridge.unbind());
+            self.bridge = Some(Held::new(bridge.unbind()));
             let address = memory.data().expose_provenance();
-            self.memory = Some(Memory { address, size: memory.len(), _owner: memory.unbind() });
+            self.memory = Some(Memory { address, size: memory.len(), _owner: Held::new(memory.unbind()) });
             Ok(description)
         })
     }

@@ -22,6 +22,7 @@ mod errors;
 mod exit;
 mod frames;
 mod gym;
+mod held;
 mod listing;
 mod model;
 mod objects;
@@ -77,6 +78,7 @@ mod _engine {
     use super::world::World;
 
     use super::*;
+    use swm::models::run_folder::{FOLDER, OLD_FOLDER};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -89,6 +91,7 @@ mod _engine {
         if let Some(folder) = finder.getattr("data_wheel")?.call0()?.extract::<Option<PathBuf>>()? {
             swm::zoo::set_data_wheel(folder);
         }
+        module.add("CHECKPOINT_FOLDERS", [FOLDER, OLD_FOLDER])?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

@@ -3,6 +3,7 @@
 use crate::arrays;
 use crate::errors::attached;
 use crate::exit;
+use crate::held::Held;
 use numpy::{PyArray1, PyArrayMethods as _};
 use pyo3::prelude::*;
 use std::ops::ControlFlow;
@@ -15,12 +16,12 @@ use swm::plan::PlanObserver;
 ///   `candidates` and `gradient` are arrays `[envs, samples, horizon, dim]`, `costs` `[envs, samples]`, `elites` the
 ///   indices `[envs, elites]`, cheapest first; `elites` and `gradient` are `None` for solvers without them.
 /// - `begin(envs)` and `end()` surround every search of a policy.
-pub struct PythonObserver(Py<PyAny>);
+pub struct PythonObserver(Held<Py<PyAny>>);
 
 impl PythonObserver {
     /// Wraps an object.
     pub fn new(observer: Py<PyAny>) -> Self {
-        Self(observer)
+        Self(Held::new(observer))
     }
 }
 

@@ -3,6 +3,7 @@
 use crate::cost::planning_model;
 use crate::errors::{attached, json, to_py_err};
 use crate::exit;
+use crate::held::Held;
 use crate::observer::PythonObserver;
 use crate::world::World;
 use crate::{arrays, solver};
@@ -90,7 +91,7 @@ impl Actor {
         let infos = World::infos(world)?.unbind();
         let slots = world.get().lock()?.pool().len();
         let (fresh, episodes) = (vec![false; slots], vec![0; slots]);
-        Ok(Self::new(Box::new(PythonPolicy { call, infos, fresh, episodes }), None))
+        Ok(Self::new(Box::new(PythonPolicy { call: Held::new(call), infos: Held::new(infos), fresh, episodes }), None))
     }
 
     /// Creates a planning policy. `model` is a [`crate::model::Model`], an adapter of `stable_worldmodel.planning`, or
@@ -227,8 +228,8 @@ impl Policy for OnThisThread {
 
 /// A policy implemented in Python.
 struct PythonPolicy {
-    call: Py<PyAny>,
-    infos: Py<PyDict>,
+    call: Held<Py<PyAny>>,
+    infos: Held<Py<PyDict>>,
     fresh: Vec<bool>,
     episodes: Vec<u64>,
 }

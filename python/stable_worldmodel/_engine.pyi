@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 __version__: str
+#: The folders of a run that may hold its checkpoint: the second one after a kill while the first was replaced.
+CHECKPOINT_FOLDERS: Sequence[str]
 
 _Array = npt.NDArray[Any]
 _Ints = npt.NDArray[np.int64]

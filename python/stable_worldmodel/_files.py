@@ -13,8 +13,6 @@ from pathlib import Path
 
 #: How long :func:`locked` waits for another process, in seconds.
 _MOST_WAIT = 30.0
-#: The folders of a run that may hold its checkpoint: the second one after a kill while the first was replaced.
-CHECKPOINT_FOLDERS = ("checkpoint", ".checkpoint.old")
 
 
 def local(what: str, path: str | os.PathLike[str]) -> Path:

@@ -62,7 +62,7 @@ impl PolicyChoice {
     /// Makes the choice of these policies.
     ///
     /// # Errors
-    /// When there is no policy, or a weight is not positive and finite.
+    /// When there is no policy, or a weight or the sum of all weights is not positive and finite.
     pub fn new(mut policies: Vec<WeightedPolicy>) -> Result<Self> {
         if let Some(WeightedPolicy { name, weight }) =
             policies.iter().find(|policy| !(policy.weight > 0.0 && policy.weight.is_finite()))
@@ -72,6 +72,9 @@ impl PolicyChoice {
                 weight.to_string(),
                 "give a positive weight, such as expert:0.7",
             ));
+        }
+        if !policies.iter().map(|policy| policy.weight).sum::<f64>().is_finite() {
+            return Err(Error::config("the weights of the policies", "their sum is infinite", "give smaller ones"));
         }
         match policies.len() {
             0 => Err(Error::config("policies", "none is given", "name at least one policy")),
@@ -208,6 +211,8 @@ mod tests {
                 parsed(&["expert", &format!("random:{weight}")]).expect_err("the weight is invalid").to_string();
             assert!(error.contains("'random'") && error.contains("positive"), "{error}");
         }
+        let error = parsed(&["expert:1e308", "random:1e308"]).expect_err("the sum is infinite").to_string();
+        assert!(error.contains("sum"), "{error}");
         assert!(parsed(&[]).is_err());
         let one =
             serde_json::from_str::<PolicyChoice>(r#"[{"name":"expert","weight":2}]"#).expect("reading one policy");

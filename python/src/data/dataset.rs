@@ -4,6 +4,7 @@ use super::foreign::ForeignReader;
 use super::process::detached;
 use super::{BatchMemory, Column, columns, described};
 use crate::errors::to_py_err;
+use crate::held::Held;
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
@@ -117,6 +118,7 @@ impl Dataset {
     /// The episodes of several datasets, one after another.
     #[staticmethod]
     fn concat(py: Python<'_>, parts: Vec<Py<Self>>) -> PyResult<Self> {
+        let parts = Held::new(parts);
         let open = move || views::concat(parts.iter().map(|part| part.get().reader()).collect::<Result<_>>()?);
         Self::of(py, Arc::new(open))
     }
@@ -124,6 +126,7 @@ impl Dataset {
     /// A dataset extended by columns of another dataset with the same episodes.
     #[staticmethod]
     fn merge(py: Python<'_>, base: Py<Self>, other: Py<Self>, names: Vec<String>) -> PyResult<Self> {
+        let (base, other) = (Held::new(base), Held::new(other));
         let open = move || {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             views::merge(base.get().reader()?, other.get().reader()?, &names)
@@ -133,6 +136,7 @@ impl Dataset {
 
     /// A view of some columns of the dataset, preceded by the index columns.
     fn select(slf: Py<Self>, py: Python<'_>, names: Vec<String>) -> PyResult<Self> {
+        let slf = Held::new(slf);
         let open = move || {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             views::select(slf.get().reader()?, &names)
@@ -142,6 +146,7 @@ impl Dataset {
 
     /// A view of the dataset that caches decoded rows of some columns in memory, up to `bytes` bytes.
     fn cached(slf: Py<Self>, py: Python<'_>, names: Vec<String>, bytes: usize) -> PyResult<Self> {
+        let slf = Held::new(slf);
         let open = move || {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             CacheConfig::Memory { bytes }.over(slf.get().reader()?, &names)

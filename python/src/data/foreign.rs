@@ -4,6 +4,7 @@ use super::{Column, described, schema};
 use crate::arrays;
 use crate::errors::attached;
 use crate::exit;
+use crate::held::Held;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use swm::core::columns::{EPISODE_IDX, STEP_IDX};
@@ -17,7 +18,7 @@ const INDEX_COLUMNS: [&str; 2] = [EPISODE_IDX, STEP_IDX];
 /// `lengths()` returns the number of rows of every episode; `rows(column, episode, start, length)` returns an array
 /// `[length, ..]` of the column's type.
 pub struct ForeignReader {
-    object: Py<PyAny>,
+    object: Held<Py<PyAny>>,
     schema: Schema,
     episodes: Vec<Episode>,
 }
@@ -34,7 +35,7 @@ impl ForeignReader {
         let schema = schema(indices.into_iter().chain(data).collect())?;
         let lengths: Vec<usize> = exit::call_method(object.bind(py), "lengths", ())?.extract()?;
         let episodes = lengths.into_iter().enumerate().map(|(i, length)| Episode { index: i as i64, length }).collect();
-        Ok(Self { object, schema, episodes })
+        Ok(Self { object: Held::new(object), schema, episodes })
     }
 
     fn rows(&self, column: &str, range: &StepRange) -> Result<Batch> {
@@ -110,14 +111,14 @@ impl Reader for ForeignReader {
 /// A writer that passes episodes to a Python object: `write_episode({column: array [rows, ..]})`. The object does not
 /// get the constants of an episode.
 pub struct ForeignWriter {
-    object: Py<PyAny>,
+    object: Held<Py<PyAny>>,
     episodes: usize,
 }
 
 impl ForeignWriter {
     /// Writes to `object`, whose dataset already has `episodes` episodes.
     pub fn new(object: Py<PyAny>, episodes: usize) -> Self {
-        Self { object, episodes }
+        Self { object: Held::new(object), episodes }
     }
 }
 

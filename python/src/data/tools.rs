@@ -5,6 +5,7 @@ use super::image_codec;
 use super::process::detached;
 use crate::errors::{from_py_err, json, signal_poll, to_py_err};
 use crate::exit;
+use crate::held::Held;
 use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Value, json as value};
@@ -63,14 +64,15 @@ fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let mut poll = signal_poll();
     let control =
         Control::new().with_poll(move || match failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            Some(error) => Err(from_py_err(error)),
+            Some(error) => Err(error),
             None => poll(),
         });
-    let Some(progress) = progress else { return control };
+    let Some(progress) = progress.map(Held::new) else { return control };
     control.with_events(move |event| {
         let Event::Progress(at) = event else { return };
         let outcome = Python::try_attach(|py| exit::call(progress.bind(py), (at.stage, at.done, at.total)).map(drop));
         if let Some(Err(error)) = outcome {
+            let error = from_py_err(error);
             callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }
     })

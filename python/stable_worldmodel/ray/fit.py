@@ -17,7 +17,7 @@ from typing import Any
 
 import ray
 
-from .._files import CHECKPOINT_FOLDERS
+from .. import _engine
 from ..train.options import Options, settings_of
 from .supply import WAIT_SECONDS, RunRefused
 
@@ -71,7 +71,7 @@ def fitted(options: Options, resources: Mapping[str, float] | None = None, wait:
     from .local import connect
 
     run = options.run.resolve()
-    if not options.resume and any((run / name).exists() for name in CHECKPOINT_FOLDERS):
+    if not options.resume and any((run / name).exists() for name in _engine.CHECKPOINT_FOLDERS):
         raise ValueError(f"{run}: holds a checkpoint; continue it with resume=true, or choose another folder")
     # Processes have another current folder. Their first start is told from a restart by the checkpoint.
     data = str(Path(options.data).resolve()) if Path(options.data).exists() else options.data

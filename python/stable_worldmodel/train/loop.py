@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from .. import _engine
-from .._files import CHECKPOINT_FOLDERS
 from ..data.foreign import engine_of
 from ..data.loader import Goals, Loader
 from ..data.utils import load_dataset
@@ -79,7 +78,7 @@ class Trainer:
         """Writes the command and the first checkpoint of the training, or checks the checkpoint that it continues."""
         options = self.options
         # A kill while a checkpoint is replaced leaves the old one, which the engine gives its name back.
-        self.resumed = options.resume and any((self.run / name).is_dir() for name in CHECKPOINT_FOLDERS)
+        self.resumed = options.resume and any((self.run / name).is_dir() for name in _engine.CHECKPOINT_FOLDERS)
         settings = list(options.settings)
         family, preset, command = options.family, options.preset, options.command()
         dataset, out = engine_of(dataset), str(self.run)

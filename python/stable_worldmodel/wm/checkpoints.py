@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from .. import _engine
-from .._files import CHECKPOINT_FOLDERS
 from ._weights import load_into, read_capsule, read_safetensors
 from .encoders import encoder_of
 from .frames import Frames
@@ -93,7 +92,7 @@ def is_stored(path: Path) -> bool:
 
 def _folder_of(path: Path) -> Path | None:
     """The folder of a run that holds the checkpoint."""
-    folders = (path, *(path / name for name in CHECKPOINT_FOLDERS))
+    folders = (path, *(path / name for name in _engine.CHECKPOINT_FOLDERS))
     return next((folder for folder in folders if (folder / "weights.safetensors").is_file()), None)
 
 

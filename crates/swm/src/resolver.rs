@@ -479,8 +479,8 @@ fn find_expert(entry: &EnvEntry, name: &str) -> Result<Option<&'static ExpertEnt
 /// When no score has the name.
 pub fn parse_score(name: &str) -> Result<Score> {
     serde_json::from_value(name.into()).map_err(|_| {
-        let known = ["terminal", "running", "reach", "success"];
-        Error::unknown("score", name, known, format!("the scores of simulated plans are {}", known.join(", ")))
+        let hint = format!("the scores of simulated plans are {}", Score::NAMES.join(", "));
+        Error::unknown("score", name, Score::NAMES, hint)
     })
 }
 

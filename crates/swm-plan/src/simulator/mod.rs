@@ -34,6 +34,13 @@ pub enum Score {
     Reach,
     /// As [`Score::Reach`], with [`Env::success_distance`] as the distance.
     Success,
+    /// Minus the sum of the rewards, up to the end of the episode.
+    Reward,
+}
+
+impl Score {
+    /// The names of all scores, in their order.
+    pub const NAMES: [&str; 5] = ["terminal", "running", "reach", "success", "reward"];
 }
 
 /// The simulator as a model.
@@ -66,10 +73,16 @@ impl SimulatorCost {
         let width = self.playback.width();
         let mut sum = 0.0;
         for (step, planned) in actions.chunks_exact(width).enumerate() {
-            self.playback.step(simulator, planned)?;
+            let outcome = self.playback.step(simulator, planned)?;
             let env = &*simulator.env;
             match self.score {
                 Score::Terminal => {}
+                Score::Reward => {
+                    sum -= outcome.reward;
+                    if outcome.terminated || outcome.truncated {
+                        return Ok(sum);
+                    }
+                }
                 Score::Running => sum += env.goal_distance(),
                 Score::Reach | Score::Success if env.is_success() => {
                     let steps = actions.len() / width;
@@ -80,7 +93,7 @@ impl SimulatorCost {
         }
         Ok(match self.score {
             Score::Terminal | Score::Reach => simulator.env.goal_distance(),
-            Score::Running => sum,
+            Score::Running | Score::Reward => sum,
             Score::Success => simulator.env.success_distance(),
         })
     }

@@ -2,7 +2,7 @@
 
 use crate::mpc::{ActionCodec, ActionScale, Decoded};
 use std::sync::{Mutex, PoisonError};
-use swm_core::{Candidates, Env, Error, Result, Snapshot};
+use swm_core::{Candidates, Env, Error, Result, Snapshot, Transition};
 
 /// Makes a private environment.
 type Make = Box<dyn Fn() -> Result<Box<dyn Env>> + Send + Sync>;
@@ -65,8 +65,8 @@ impl Playback {
     }
 
     /// Steps a simulator with one action, `[width]` plan values.
-    pub fn step(&self, simulator: &mut Simulator, planned: &[f32]) -> Result<()> {
-        simulator.env.step(self.codec.decode(planned, &mut simulator.action)).map(drop)
+    pub fn step(&self, simulator: &mut Simulator, planned: &[f32]) -> Result<Transition> {
+        simulator.env.step(self.codec.decode(planned, &mut simulator.action))
     }
 
     /// Keeps a snapshot of the environment of a slot, as [`swm_core::CostModel::observe_env`].

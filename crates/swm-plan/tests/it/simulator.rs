@@ -49,26 +49,27 @@ fn actions(rng: &mut Rng, n: usize) -> Vec<f32> {
 }
 
 #[test]
-fn costs_equal_distances_in_the_environment() {
+fn costs_equal_distances_and_rewards_in_the_environment() {
     for entry in [&two_room::ENTRY, &push_t::ENTRY] {
         let samples = 5;
         let actions = actions(&mut Key::new(1).rng(), samples * HORIZON * BLOCK * 2);
         let pool = pool(entry, 2);
-        for score in [Score::Terminal, Score::Running] {
+        for score in [Score::Terminal, Score::Running, Score::Reward] {
             let costs = costs(&mut simulator(entry, &pool, &[1], score), &actions, 1, samples);
             for (candidate, cost) in actions.chunks_exact(HORIZON * BLOCK * 2).zip(costs) {
                 let mut environment = entry.env().expect("creating the environment");
                 environment.restore(&pool.env(1).snapshot()).expect("restoring the snapshot");
-                let distances: Vec<f64> = candidate
-                    .chunks_exact(2)
-                    .map(|action| {
-                        let action = [action[0].clamp(-1.0, 1.0), action[1].clamp(-1.0, 1.0)];
-                        environment.step(Action::Continuous(&action)).expect("stepping the environment");
-                        environment.goal_distance()
-                    })
-                    .collect();
+                let (mut distances, mut rewards) = (vec![], 0.0);
+                for action in candidate.chunks_exact(2) {
+                    let action = [action[0].clamp(-1.0, 1.0), action[1].clamp(-1.0, 1.0)];
+                    let outcome = environment.step(Action::Continuous(&action)).expect("stepping the environment");
+                    assert!(!outcome.terminated && !outcome.truncated, "a random plan is not the end");
+                    distances.push(environment.goal_distance());
+                    rewards += outcome.reward;
+                }
                 let expected = match score {
                     Score::Running => distances.iter().sum(),
+                    Score::Reward => 0.0 - rewards,
                     _ => distances[distances.len() - 1],
                 };
                 assert_eq!(cost.to_bits(), (expected as f32).to_bits(), "{}, {score:?}", entry.id);
@@ -99,6 +100,28 @@ fn reach_score_counts_remaining_steps_or_the_final_distance() {
         [-0.5, 20.0, -0.5],
         "3 of 6 steps remain; the goal is 20 pixels away; later steps change nothing"
     );
+}
+
+#[test]
+fn reward_score_ends_with_the_episode() {
+    let entry = &two_room::ENTRY;
+    let mut pool = pool(entry, 1);
+    let (state, goal_state) = (Some(vec![30.0, 100.0]), Some(vec![60.0, 100.0]));
+    pool.restart(&[0], |_, env| {
+        env.reset(0, &ResetOptions { state: state.clone(), goal_state: goal_state.clone(), ..ResetOptions::default() })
+    })
+    .expect("resetting the environment");
+    let mut environment = entry.env().expect("creating the environment");
+    environment.restore(&pool.env(0).snapshot()).expect("restoring the snapshot");
+    let mut rewards = 0.0;
+    let ended = (1..=6).find(|_| {
+        let outcome = environment.step(Action::Continuous(&[1.0, 0.0])).expect("stepping the environment");
+        rewards += outcome.reward;
+        outcome.terminated
+    });
+    assert!(ended.is_some_and(|steps| steps < 6), "{ended:?}: the goal ends the episode");
+    let walk: Vec<f32> = (0..6).flat_map(|_| [1.0, 0.0]).collect();
+    assert_eq!(costs(&mut simulator(entry, &pool, &[0], Score::Reward), &walk, 1, 1), [(0.0 - rewards) as f32]);
 }
 
 #[test]

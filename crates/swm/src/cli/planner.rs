@@ -50,7 +50,7 @@ pub struct PlannerArgs {
     /// Constraint, such as action_norm,limit=2 or latent_box
     #[arg(long = "limit", value_name = "NAME[,KEY=VALUE…]")]
     pub limits: Vec<String>,
-    /// Score of simulated plans: terminal, running, reach or success
+    /// Score of simulated plans: terminal, running, reach, success or reward
     #[arg(long, default_value = "terminal")]
     pub score: String,
 }

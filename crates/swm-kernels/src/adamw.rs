@@ -53,11 +53,18 @@ impl Kernel for Update<'_> {
         let moments = self.first.iter_mut().zip(self.second.iter_mut());
         for ((value, gradient), (first, second)) in self.values.iter_mut().zip(self.gradient).zip(moments) {
             let gradient = gradient * factor;
-            *first = *first * betas[0] + gradient * weights[0];
-            *second = *second * betas[1] + gradient * gradient * weights[1];
+            *first = normal_or_zero(*first * betas[0] + gradient * weights[0]);
+            *second = normal_or_zero(*second * betas[1] + gradient * gradient * weights[1]);
             *value = *value * keep - *first / (second.sqrt() / root_bias + epsilon) * rate;
         }
     }
+}
+
+/// Returns the value, or zero if it is below the smallest normal number. The moments of a unit that is never active would stay there for
+/// ever: 0.9 times the smallest number of all is rounded to itself. Processors compute with such numbers many times slower.
+#[inline(always)]
+fn normal_or_zero(value: f32) -> f32 {
+    if value.abs() < f32::MIN_POSITIVE { 0.0 } else { value }
 }
 
 /// Returns the sum of the squares. The elements are added in the same order on any number of threads.
@@ -80,6 +87,25 @@ impl Kernel for Squares<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn moments_of_a_dead_unit_end_at_zero() {
+        let step = AdamWStep {
+            gradient: 1.0,
+            betas: [0.9, 0.99],
+            weights: [0.1, 0.01],
+            root_bias: 1.0,
+            epsilon: 1e-8,
+            keep: 1.0,
+            rate: 0.01,
+        };
+        let (mut values, mut first, mut second) = ([0.5, 0.5], [1e-3, f32::NAN], [1e-6, 1e-6]);
+        for _ in 0..10_000 {
+            step.apply(&mut values, &[0.0; 2], &mut first, &mut second);
+        }
+        assert_eq!((first[0], second), (0.0, [0.0; 2]));
+        assert!(first[1].is_nan() && values[1].is_nan() && values[0].is_finite());
+    }
 
     #[test]
     fn steps_match_the_definition_in_double_precision() {

@@ -6,6 +6,7 @@ use crate::data::process::Owned;
 use crate::errors::{attached, control, from_py_err, json, signal_poll, to_py_err};
 use crate::exit;
 use crate::gym::{InProcess, is_in_call};
+use crate::held::Held;
 use crate::policy::Actor;
 use crate::snapshots;
 use pyo3::exceptions::PyIndexError;
@@ -126,6 +127,7 @@ impl World {
         wrap_goal: bool,
     ) -> PyResult<Self> {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
+        let make = Held::new(make);
         let config = WorldConfig { envs, image, views: vec![], max_episode_steps, threads };
         let world = exit::detached(py, || {
             let made = || -> swm::core::Result<Box<dyn Env>> {
@@ -307,6 +309,7 @@ impl World {
             _ => WriteMode::Create,
         };
         let codec: ImageCodec = codec.map_or(Ok(ImageCodec::default()), |text| json("codec", text))?;
+        let (writer, mut control) = (writer.map(|writer| ForeignWriter::new(writer, 0)), control(progress));
         let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let collected = exit::detached(py, || {
@@ -341,11 +344,11 @@ impl World {
             let Existing { continues, not_finite } = existing.transpose()?.unwrap_or_default();
             manifest.not_finite = not_finite;
             let writer: Box<dyn swm::data::Writer> = match (writer, &location) {
-                (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),
+                (Some(writer), _) => Box::new(writer),
                 (None, Some(location)) => create(location, mode, manifest.clone(), continues)?,
                 (None, None) => return Err(Error::config("World.collect", "no target is given", "give a path")),
             };
-            let collected = world.collect(policy, writer, &config, &mut control(progress));
+            let collected = world.collect(policy, writer, &config, &mut control);
             let warning = collect_target::describe_not_finite(world.not_finite());
             if let (Some(_), Some(location)) = (&warning, &location) {
                 collect_target::add_not_finite(&mut manifest, world.not_finite());
@@ -367,6 +370,7 @@ impl World {
         progress: Option<Py<PyAny>>,
     ) -> PyResult<String> {
         let settings: Evaluation = json("evaluation", config)?;
+        let mut control = control(progress);
         let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let run = exit::detached(py, || {
@@ -402,7 +406,7 @@ impl World {
                 planning_seed: None,
                 videos,
             };
-            world.evaluate(policy, &starts, &config, &mut control(progress))
+            world.evaluate(policy, &starts, &config, &mut control)
         });
         serde_json::to_string(&run.map_err(to_py_err)?)
             .map_err(|error| to_py_err(Error::external("writing the run as JSON", error)))

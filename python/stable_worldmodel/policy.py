@@ -8,6 +8,7 @@ policies plays depends only on its seed, not on its slot or on other episodes.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import _engine, _options
+from ._overrides import is_overridden
 from .buffer import HistoryBuffer
 from .planning.adapter import has_torch, prepared
 from .planning.solver.engine import PLANS, EngineSolver, NotConfigured, single
@@ -59,8 +61,13 @@ class PlanConfig:
 
     def __post_init__(self) -> None:
         for name in ("horizon", "receding_horizon", "history_len", "action_block"):
-            if int(getattr(self, name)) < 1:
-                raise ValueError(f"PlanConfig.{name}: {getattr(self, name)}; expected at least 1")
+            # The class is frozen. Numbers of numpy become those of Python, which JSON can hold.
+            object.__setattr__(self, name, _options.count(f"PlanConfig.{name}", getattr(self, name)))
+        if not isinstance(self.warm_start, (bool, np.bool_)):
+            raise ValueError(f"PlanConfig.warm_start: {self.warm_start!r}; expected True or False")
+        object.__setattr__(self, "warm_start", bool(self.warm_start))
+        if self.latency_budget is not None:
+            object.__setattr__(self, "latency_budget", _seconds("PlanConfig.latency_budget", self.latency_budget))
         if self.receding_horizon > self.horizon:
             raise ValueError(
                 f"PlanConfig: receding_horizon={self.receding_horizon} steps to execute exceed the {self.horizon} planned "
@@ -71,6 +78,17 @@ class PlanConfig:
     def plan_len(self) -> int:
         """Environment steps of a plan."""
         return self.horizon * self.action_block
+
+
+def _seconds(name: str, value: Any) -> float:
+    """The value as a positive time."""
+    try:
+        seconds = math.nan if isinstance(value, (str, bytes, bool)) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"{name}: {value!r}; expected more than 0 seconds, or None for no limit")
+    return seconds
 
 
 class BasePolicy:
@@ -330,7 +348,9 @@ class MPCPolicy(BasePolicy):
 
     def _actor(self, world: World) -> Any:
         scale = _scale(self.process.get("action"))
-        if not isinstance(self.solver, EngineSolver) or (scale is None and "action" in self.process):
+        if not isinstance(self.solver, EngineSolver) or is_overridden(self.solver, "solve"):
+            return None
+        if scale is None and "action" in self.process:
             return None
         # Another world may have taken the solver meanwhile.
         self.solver.configure(action_space=world.envs.action_space, n_envs=world.num_envs, config=self.cfg)

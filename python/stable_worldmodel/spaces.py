@@ -262,11 +262,25 @@ class Dict(spaces.Dict):
 
     def check(self, debug: bool = False) -> bool:
         """Whether every current value is in its space and all conditions hold."""
-        wrong = [key for key, factor in self.factors() if _has_value(factor) and not factor.check()]
+        wrong = list(self._wrong())
         if debug and wrong:
             names = ", ".join(wrong)
             warnings.warn(f"the values of {names} are outside their spaces or violate a constrain_fn", stacklevel=2)
-        return not wrong and (self.constrain_fn is None or bool(self.constrain_fn(self.value)))
+        return not wrong and self._holds()
+
+    def _wrong(self) -> Iterator[str]:
+        """The dot keys of the factors and groups whose values are outside their spaces or violate their conditions."""
+        for key, space in self.spaces.items():
+            if isinstance(space, Dict):
+                inside = [f"{key}.{inner}" for inner in space._wrong()]
+                # A condition may not support values outside of the spaces.
+                yield from inside if inside or space._holds() else [key]
+            elif _has_value(space) and not space.check():
+                yield key
+
+    def _holds(self) -> bool:
+        """Whether the current values satisfy the condition of the `Dict` itself."""
+        return self.constrain_fn is None or bool(self.constrain_fn(self.value))
 
     def sample(  # type: ignore[override]
         self, mask: Any = None, max_tries: int = TRIES, warn_after_s: float = 5.0, set_value: bool = True, **kwargs: Any
@@ -299,21 +313,30 @@ class Dict(spaces.Dict):
         return space.sample(mask, set_value=set_value, probability=probability)
 
     def update(self, keys: Iterable[str]) -> None:
-        """Samples these factors and groups in sampling order; `all` selects every factor."""
+        """Samples these factors and groups in sampling order, until the conditions of all groups that they are in hold.
+
+        `all` selects every factor.
+        """
         selected = set(keys)
         if "all" in selected:
             self.sample()
             return
         for key in selected:
             self.find(key)
+        self._update(selected)
+
+    def _update(self, selected: set[str]) -> None:
         for _ in range(TRIES):
-            for key in self.sampling_order:
-                inside = any(key.startswith(f"{group}.") for group in selected)
-                if key in selected or (inside and not isinstance(self.find(key), Dict)):
-                    self.find(key).sample()
-            if self.constrain_fn is None or self.constrain_fn(self.value):
+            for key in self._sampling_order:
+                if key in selected:
+                    self.spaces[key].sample()
+                elif inner := {name.removeprefix(f"{key}.") for name in selected if name.startswith(f"{key}.")}:
+                    self.spaces[key]._update(inner)
+            if self._holds():
                 return
-        raise RuntimeError(f"the factors' common constrain_fn did not hold in {TRIES} tries; vary fewer of them")
+        raise RuntimeError(
+            f"the common constrain_fn of {', '.join(self.spaces)} did not hold in {TRIES} tries; vary all of them, or others"
+        )
 
     def set_init_value(self, variations_values: Mapping[str, Any]) -> None:
         """Changes defaults, by dot key."""

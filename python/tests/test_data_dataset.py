@@ -78,6 +78,27 @@ def test_cached_and_merged_columns_have_the_stored_values(stored):
     assert dataset.get_dim("both") == 6
 
 
+def test_merged_columns_replace_stored_ones_everywhere(stored, tmp_path):
+    path, written, lists = stored
+    keys = {"state": ["state", "action"], "twice": ["reward"]}
+    dataset = data.load_dataset(path, num_steps=3, frameskip=2, backend="numpy", keys_to_merge=keys)
+    assert dataset[0]["state"].shape == (3, 6)
+    again = pickle.loads(pickle.dumps(dataset))
+    for joined in (dataset, again, data.ConcatDataset([dataset, dataset]), data.MergeDataset([dataset])):
+        batches = list(data.Loader(joined, 8, shuffle=False))
+        assert set(batches[0]) == set(joined[0])
+        for name in ("state", "twice", "action", "pixels"):
+            found = np.concatenate([batch[name] for batch in batches])
+            np.testing.assert_array_equal(found, [joined[i][name] for i in range(len(joined))])
+    data.convert(dataset, tmp_path / "copy.h5", progress=False)
+    copied = data.load_dataset(tmp_path / "copy.h5", backend="numpy")
+    np.testing.assert_array_equal(copied.get_col_data("state"), dataset.get_col_data("state"))
+    columns = {column["name"]: column["shape"] for column in data.inspect(dataset)["columns"]}
+    assert columns["state"] == [6] and columns["twice"] == ([1] if lists else [])
+    with pytest.raises(ValueError, match="have 142 rows, expected 71"):
+        dataset.merge_col(["state", "state"], "long", dim=0)
+
+
 def test_transform_gets_rows_before_frameskip_joins_actions(stored):
     path, _, _ = stored
     seen = []
@@ -241,6 +262,24 @@ def test_datasets_with_other_clips_are_not_joined(kind, tmp_path):
     for other in others:
         with pytest.raises(ValueError, match="the same num_steps and frameskip, got"):
             kind([a, other])
+
+
+def test_merged_datasets_take_each_column_from_one_dataset(tmp_path):
+    for name in "ab":
+        with data.open_writer(tmp_path / f"{name}.h5") as writer:
+            writer.write_episode({"x": np.arange(4.0) + (name == "b"), "action": np.zeros((3, 1), np.float32)})
+    a, b = (data.load_dataset(tmp_path / f"{name}.h5", backend="numpy") for name in "ab")
+    for keys, error, message in (
+        ([["x", "action"], ["x"]], ValueError, "'x' would be taken twice"),
+        ([["action"], ["nope", "x"]], KeyError, "dataset 1 has no column 'nope'; its columns are x, action"),
+        ([["x"]], ValueError, "a list of columns for each of 2 datasets, got 1"),
+    ):
+        with pytest.raises(error, match=message):
+            data.MergeDataset([a, b], keys)
+    merged = data.MergeDataset([a, b], [["action"], ["x"]])
+    assert merged[0]["x"] == merged.get_col_data("x")[0] == 1
+    data.convert(data.MergeDataset([a, b], [["x"], []]), tmp_path / "c.h5", progress=False)
+    assert data.load_dataset(tmp_path / "c.h5").column_names == ["x"], "only the columns that are chosen"
 
 
 def test_goals_of_joined_datasets_are_rows_of_the_same_episode(tmp_path):

@@ -152,6 +152,53 @@ def test_transform_is_applied_before_frameskip_joins_actions(stored):
     np.testing.assert_allclose(scaled["action"], plain["action"] / [2, 4, 2, 4])
 
 
+def relative(sample):
+    return {**sample, "state": sample["state"] - sample["state"][0], "sum": sample["action"].sum() + sample["reward"].sum()}
+
+
+def doubled(sample):
+    sample["state"] = 2 * sample["state"]
+    return {**sample, "sum": sample["action"].shape[0] + 0 * sample["reward"].sum()}
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("suffix", ["lance", "h5"])
+def test_transform_of_a_dataset_gets_every_sample(tmp_path, suffix, backend):
+    if backend == "torch":
+        pytest.importorskip("torch")
+    write(tmp_path / f"a.{suffix}", (8, 9))
+    write(tmp_path / f"b.{suffix}", (7,))
+    clip = {"num_steps": 3, "frameskip": 2, "backend": backend}
+    a, b, plain = (
+        data.load_dataset(tmp_path / f"{name}.{suffix}", transform=transform, **clip)
+        for name, transform in (("a", relative), ("b", doubled), ("a", None))
+    )
+    both = data.ConcatDataset([b, a])
+    merged = data.MergeDataset([plain, a], [["pixels"], ["state", "action", "reward"]])
+    nested = data.ConcatDataset([merged, merged])
+    for dataset in (a, both, merged, nested):
+        batches = list(data.Loader(dataset, 4, shuffle=False, backend=backend))
+        found = [{name: column[i] for name, column in batch.items()} for batch in batches for i in range(len(batch["state"]))]
+        assert len(found) == len(dataset)
+        for i, sample in enumerate(found):
+            expected = dataset[i]
+            assert set(sample) == set(expected)
+            for name, value in expected.items():
+                np.testing.assert_array_equal(np.asarray(sample[name]), np.asarray(value), err_msg=name)
+    # A process without samples of the last batch has the columns of the others.
+    last = list(data.Loader(a, len(a) - 1, shuffle=False, rank=1, world_size=2))[-1]
+    assert {name: len(column) for name, column in last.items()} == dict.fromkeys(a[0], 0)
+    with pytest.raises(ValueError, match="this process got no samples"):
+        list(data.Loader(a, 1, shuffle=False, rank=1, world_size=2))
+    # The transform of the loader gets the batch of transformed samples.
+    batch = next(iter(data.Loader(a, 4, shuffle=False, transform=lambda batch: {"sums": 2 * batch["sum"]})))
+    np.testing.assert_array_equal(np.asarray(batch["sums"]), [2 * np.asarray(a[i]["sum"]) for i in range(4)])
+    lengths = iter(range(1, 9))
+    a.transform = lambda sample: {"x": np.zeros(next(lengths))}
+    with pytest.raises(ValueError, match="values of 'x' cannot be stacked.*use torch's DataLoader"):
+        next(iter(data.Loader(a, 4)))
+
+
 def test_loader_uses_the_settings_of_the_dataset(stored):
     path, _ = stored
     dataset = data.load_dataset(path, num_steps=2, frameskip=3, keys_to_load=["state"], backend="numpy")

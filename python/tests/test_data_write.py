@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -124,6 +125,19 @@ def test_lists_and_small_types_are_converted(tmp_path):
     assert np.isnan(sample["action"][3]).all() and (sample["action"][:3] == [0, 1]).all()
     assert sample["half"].dtype == np.float32 and sample["small"].dtype == np.int32
     assert dataset.get_col_data("step_idx").tolist() == [0, 1, 2, 3], "the writer computes the indices"
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "bool"])
+def test_missing_actions_are_not_invented(tmp_path, dtype):
+    path = tmp_path / "a.lance"
+    content = {"x": np.arange(4.0), "action": np.ones(3, dtype)}
+    with data.open_writer(path) as writer:
+        for target in (writer, data.ReplayBuffer(100)):
+            with pytest.raises(ValueError, match=f"3 actions of 4 steps, .* {dtype} has no value .*; convert the actions"):
+                target.write_episode(content)
+        with pytest.warns(UserWarning, match="the action of an episode's last row is stored"):
+            writer.write_episode({**content, "action": np.ones(4, dtype)})
+    assert data.load_dataset(path).get_col_data("action").ravel().tolist() == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize("mode", ["append", "overwrite"])
@@ -320,6 +334,60 @@ def test_user_defined_format_is_read_written_and_converted(tmp_path, numpy_forma
         data.inspect(tmp_path / "a.npzs", checksum=True)["checksum"]
         == data.inspect(data.load_dataset(tmp_path / "c", format="npz"), checksum=True)["checksum"]
     )
+
+
+def test_conversion_warns_of_texts_that_a_user_defined_format_loses(tmp_path, numpy_format):
+    content = {"state": np.zeros((4, 2)), "action": np.zeros((3, 1)), "words": "go", data.EPISODE_DATA_KEY: {"mass": 2.5}}
+    with data.open_writer(tmp_path / "a.h5") as writer:
+        writer.write_episodes([episode(0, 4), episode(1, 4) | {"words": "go"}])
+
+    def converted(source, dest, names):
+        with pytest.warns(UserWarning, match=f"{dest}: {names} are left out"):
+            report = data.convert(source, tmp_path / dest, progress=False)
+        return report
+
+    assert converted(tmp_path / "a.h5", "b.npzs", "words") == {"episodes": 2, "rows": 8}
+
+    class Reader:
+        lengths = (4, 4)
+
+        def load_episode(self, index):
+            return content if index else {name: content[name] for name in ("state", "action")}
+
+    report = converted(Reader(), "c.lance", "episode_data, words")
+    assert report["episodes"] == 2
+    assert converted(Reader(), "d.npzs", "episode_data, words") == {"episodes": 2, "rows": 8}
+    # Conversions that lose nothing do not warn.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data.convert(tmp_path / "a.h5", tmp_path / "e.lance", progress=False)
+        data.convert(tmp_path / "b.npzs", tmp_path / "f.lance", progress=False)
+    assert data.load_dataset(tmp_path / "e.lance").constants(1) == {"words": b"go"}
+
+
+def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, monkeypatch):
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False, image_shape=None, max_episode_steps=6)
+
+    def collected(path, mode, episodes):
+        policy = swm.policy.RandomPolicy(1)
+        return world.collect(path, policy=policy, episodes=episodes, seed=1, mode=mode, progress=False)
+
+    for mode, count, stored, added in (("resume", 3, 3, 3), ("resume", 5, 5, 2), ("resume", 4, 5, 0), ("append", 2, 7, 2)):
+        counts = collected(tmp_path / "a.npzs", mode, count)
+        assert counts == {"episodes": stored, "added": added, "steps": 6 * added}
+    collected(tmp_path / "b.lance", "error", 7)
+    own, native = data.load_dataset(tmp_path / "a.npzs"), data.load_dataset(tmp_path / "b.lance", backend="numpy")
+    for i in range(7):
+        np.testing.assert_array_equal(own.load_episode(i)["state"], native.load_episode(i)["state"])
+
+    def unreadable(path, **kwargs):
+        raise NotImplementedError("the format cannot be read")
+
+    monkeypatch.setattr(numpy_format, "open_reader", unreadable)
+    with pytest.raises(ValueError, match="does not tell the number of episodes .the format cannot be read., .*cannot resume"):
+        collected(tmp_path / "a.npzs", "resume", 9)
+    with pytest.warns(UserWarning, match="starts again with its first episode; use another seed"):
+        collected(tmp_path / "a.npzs", "append", 1)
 
 
 def test_format_names_are_unique_and_native_formats_are_registered(numpy_format):

@@ -335,6 +335,34 @@ def test_wrong_arguments_raise_errors_with_the_reason(make, error, words):
         make()
 
 
+WRONG_LENGTHS = [
+    *((name, value) for name in ("horizon", "history_len", "action_block") for value in (0, 1.5, "many", None, True)),
+    *(("warm_start", value) for value in ("yes", None, 2)),
+    *(("latency_budget", value) for value in (0, -1.0, np.nan, np.inf, "1", True)),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), WRONG_LENGTHS)
+def test_wrong_plan_configs_name_the_field(name, value):
+    with pytest.raises(ValueError, match=rf"PlanConfig\.{name}: .*; expected"):
+        swm.PlanConfig(**{"receding_horizon": 1, name: value})
+
+
+def test_numbers_of_numpy_are_those_of_python_in_settings_of_planning():
+    config = swm.PlanConfig(np.int64(3), np.uint8(3), np.int32(1), np.array(1), np.bool_(True), np.float32(60.0))
+    assert config == swm.PlanConfig(3, 3, 1, 1, True, 60.0)
+    many = {"num_samples": 20, "n_steps": 3, "topk": 5, "var_scale": 0.5}
+    numpy = {name: np.asarray(value)[()] for name, value in many.items()}
+    assert np.array_equal(plan(solvers.CEMSolver(Quadratic(), **numpy)), plan(solvers.CEMSolver(Quadratic(), **many)))
+    weight = {"from": np.float32(2.0), "to": np.float64(0.0)}
+    assert solvers.GRASPSolver(Linear(), goal_weight=weight).settings["goal_weight"] == {"from": 2.0, "to": 0.0}
+    world = rooms(2, steps=4)
+    policy = swm.policy.MPCPolicy(solvers.CEMSolver(ToGoal(), **numpy), config)
+    assert len(world.evaluate(policy=policy, episodes=2, seed=0, floor=False, progress=False)["steps"]) == 2
+    with pytest.raises(ValueError, match="CEMSolver: var_scale=nan; expected a finite number"):
+        solvers.CEMSolver(Quadratic(), var_scale=np.float32(np.nan))
+
+
 # Planning in a `World`.
 
 

@@ -62,6 +62,24 @@ def test_invalid_values_raise_errors_with_the_reason(change, words):
         change(factors())
 
 
+def test_condition_of_a_group_holds_after_an_update_and_is_checked():
+    members = {"a": swm_spaces.Discrete(10, init_value=0), "b": swm_spaces.Discrete(10, init_value=9)}
+    group = swm_spaces.Dict(members, constrain_fn=lambda v: v["a"] < v["b"])
+    space = swm_spaces.Dict({"agent": swm_spaces.Dict({"legs": group}), "shape": swm_spaces.Discrete(3, init_value=0)})
+    for names in (["agent"], ["agent.legs"], ["agent.legs.a"], ["agent.legs.a", "agent.legs.b", "shape"], "all"):
+        for seed in range(50):
+            swm_spaces.reset_variation_space(space, seed, {"variation": names})
+            assert group.value["a"] < group.value["b"]
+    space.set_value({"agent.legs.a": 5, "agent.legs.b": 5})
+    with pytest.warns(UserWarning, match="values of agent.legs are outside"):
+        assert not space.check(debug=True)
+    with pytest.raises(ValueError, match="violate a constrain_fn"):
+        swm_spaces.reset_variation_space(space, 0, {"variation_values": {"agent.legs.b": 0}})
+    space.set_value({"agent.legs.b": 0})
+    with pytest.raises(RuntimeError, match="constrain_fn of a, b did not hold"):
+        space.update(["agent.legs.a"])
+
+
 def test_impossible_condition_raises():
     with pytest.raises(RuntimeError, match="1000 tries"):
         swm_spaces.Box(0, 1, shape=(2,), constrain_fn=lambda x: False).sample()

@@ -411,6 +411,17 @@ def test_wrong_arguments_are_refused_with_the_reason(arguments, code, message, c
     assert message in printed.err + printed.out
 
 
+def test_unknown_options_of_a_call_are_named_with_the_known_ones(rooms):
+    with pytest.raises(TypeError, match=r"^log_every: .*the options are out, preset,.* settings=\['log_every=3'\]"):
+        train("lewm", rooms, log_every=3)
+
+
+def test_engine_training_without_a_name_returns_that_of_its_checkpoint(rooms, home):
+    name = swm.wm.train("gcbc", data=rooms, preset="tiny", schedule__steps=1, data__batch_size=4)
+    assert name == "gcbc-rooms" and (home / "checkpoints" / name).is_dir()
+    assert swm.wm.load(name).card["family"] == "gcbc"
+
+
 def test_unknown_settings_are_refused(rooms, tmp_path):
     with pytest.raises(ValueError, match="model.latnt.*latent"):
         torch_train("lewm", rooms, tmp_path / "run", ["model.latnt=4"])

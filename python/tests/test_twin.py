@@ -302,6 +302,16 @@ def test_engine_model_accepts_numpy_and_torch(twins, infos):
     assert np.array_equal(burn.get_cost(steps, np.repeat(candidates, 2, 1)), np.repeat(expected, 2, 1))
 
 
+def test_engine_model_refuses_candidates_that_do_not_fit_the_infos(twins, infos):
+    burn, _ = twins
+    for shape in ((0, 4, 2, 10), (3, 0, 2, 10), (3, 4, 0, 10), (3, 4, 2, 0)):
+        with pytest.raises(ValueError, match=r"action_candidates: .*each at least 1"):
+            burn.get_cost(infos, np.zeros(shape, np.float32))
+    for envs in (1, 2, 4):
+        with pytest.raises(ValueError, match=rf"info_dict\['pixels'\]: got 3 rows, expected {envs}"):
+            burn.get_cost(infos, np.zeros((envs, 4, 2, 10), np.float32))
+
+
 def test_engine_model_reports_wrong_inputs(twins, infos):
     burn, _ = twins
     with pytest.raises(ValueError, match=r"\(B, S, H, A\)"):

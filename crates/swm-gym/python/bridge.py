@@ -358,7 +358,9 @@ class Bridge:
         self.actions = Actions(env.action_space)
         self.factors = list(factors(variation_space(env)))
         limit = max_episode_steps or getattr(env.spec, 'max_episode_steps', None)
-        self.max_episode_steps = limit or DEFAULT_STEPS
+        # Native environments state it themselves.
+        own = getattr(env.unwrapped, 'max_episode_steps', None)
+        self.max_episode_steps = limit or (own if isinstance(own, int) and own > 0 else DEFAULT_STEPS)
 
         observation, first = env.reset(seed=0)
         env.action_space.seed(0)
@@ -390,8 +392,8 @@ class Bridge:
         if frame is not None:
             self.render_shape = frame.shape[:2]
             self.frame_at = self.allocate(math.prod(self.render_shape) * 3)
-        goal = first.get('goal')
-        self.goal_shape = goal.shape[:2] if is_frame(goal) else None
+        goal = self.goal_frame(first) if frame is not None else None
+        self.goal_shape = goal.shape[:2] if goal is not None else None
         if self.goal_shape:
             self.goal_at = self.allocate(math.prod(self.goal_shape) * 3)
 
@@ -435,6 +437,26 @@ class Bridge:
                 self.frame_index = index
                 return np.empty(shape, np.uint8)
         return None
+
+    def goal_frame(self, info):
+        """The frame of the goal: `info['goal']`, else what the environment's `render_goal` gives, as that of native environments;
+        None without either."""
+        if is_frame(info.get('goal')):
+            return info['goal'][..., :3]
+        render = getattr(self.env.unwrapped, 'render_goal', None)
+        if not callable(render):
+            return None
+        try:
+            goal = render()
+        except Exception:  # Not the method of a native environment.
+            return None
+        return goal[..., :3] if is_frame(goal) else None
+
+    def write_goal(self, info):
+        """Writes the frame of the goal."""
+        if self.goal is not None:
+            goal = self.call(self.goal_frame, info)
+            self.goal[...] = 0 if goal is None else goal
 
     def describe(self):
         """The description of the environment, with offsets in the buffer, as JSON."""
@@ -515,15 +537,17 @@ class Bridge:
         observation, info = self.call(self.env.reset, seed=seed, options=options or None)
         for view in self.informed_views.values():
             view[...] = 0
+        # A native environment updates the values when its space is read.
+        variation_space(self.env)
         for leaf, view in self.factor_views:
             value = getattr(leaf, 'value', None)
             view[...] = np.asarray(leaf.init_value if value is None else value, np.float64).reshape(-1)
-        if self.goal is not None:
-            self.goal[...] = info['goal'][..., :3] if is_frame(info.get('goal')) else 0
+        self.write_goal(info)
         self.held = []
         self.write(observation, 0.0, False, False, info)
         if recorded is not None:
             self.set_recorded_state(**recorded)
+            self.write_goal(info)
 
     def set_recorded_state(self, calls, shown, held):
         """Sets a recorded state: calls methods of the environment, and writes the recorded values `shown` and `held` into

@@ -259,7 +259,12 @@ def _equal_lengths(arrays: dict[str, Array]) -> None:
     longest = max((len(array) for array in arrays.values()), default=0)
     action = arrays.get("action")
     if action is not None and len(action) == longest - 1:
-        missing = np.full((1, *action.shape[1:]), _missing(action.dtype), dtype=action.dtype)
+        if action.dtype.kind not in _MISSING:
+            raise ValueError(
+                f"column 'action': got {len(action)} actions of {longest} steps, so the last is missing, but {action.dtype} "
+                "has no value for a missing action; convert the actions to int32"
+            )
+        missing = np.full((1, *action.shape[1:]), _MISSING[action.dtype.kind], dtype=action.dtype)
         arrays["action"] = np.concatenate([action, missing])
     lengths = {name: len(array) for name, array in arrays.items()}
     if len(set(lengths.values())) > 1:
@@ -269,20 +274,25 @@ def _equal_lengths(arrays: dict[str, Array]) -> None:
 def without_last_action(arrays: dict[str, Array]) -> bool:
     """Marks the action of the last row as missing, because no observation follows it; returns whether there was one."""
     action = arrays.get("action")
-    if action is None or not len(action) or action.dtype.kind not in "fi":
+    if action is None or not len(action) or action.dtype.kind not in _MISSING:
         return False
     known = ~np.isnan(action[-1]) if action.dtype.kind == "f" else action[-1] != -1
     if not known.any():
         return False
     arrays["action"] = action = action.copy()
-    action[-1] = _missing(action.dtype)
+    action[-1] = _MISSING[action.dtype.kind]
     return True
 
 
-#: What a writer warns of, once, when an episode has an action in its last row.
+def keeps_last_action(arrays: dict[str, Array]) -> bool:
+    """Whether the action of the last row stays, because its type has no value for a missing action."""
+    action = arrays.get("action")
+    return action is not None and len(action) > 0 and action.dtype.kind not in _MISSING
+
+
+#: What a writer warns of, once, when an episode has an action in its last row: it is left out, or stays.
 LAST_ACTION = "the action of an episode's last row is left out, because no observation follows it"
+LAST_ACTION_STAYS = "the action of an episode's last row is stored, because uint8 and bool have no value for a missing action"
 
-
-def _missing(dtype: np.dtype[Any]) -> float:
-    """The value of a missing action."""
-    return {"f": np.nan, "i": -1}.get(dtype.kind, 0)
+#: The value of a missing action, by the kind of its type. Other kinds have none.
+_MISSING = {"f": np.nan, "i": -1}

@@ -159,6 +159,23 @@ class Dataset:
         raise NotImplementedError(f"{type(self).__name__}.merge_col")
 
 
+class _Merged:
+    """Columns in memory, with the methods that the engine calls: `schema`, `lengths` and `rows`."""
+
+    def __init__(self, columns: dict[str, Array], lengths: Array, offsets: Array) -> None:
+        self._columns, self._lengths, self._offsets = columns, lengths, offsets
+
+    def lengths(self) -> list[int]:
+        return [int(length) for length in self._lengths]
+
+    def schema(self) -> list[tuple[str, str, list[int]]]:
+        return [(name, array.dtype.name, list(array.shape[1:])) for name, array in self._columns.items()]
+
+    def rows(self, column: str, episode: int, start: int, length: int) -> Array:
+        first = int(self._offsets[episode]) + start
+        return np.ascontiguousarray(self._columns[column][first : first + length])
+
+
 class StoredDataset(Dataset):
     """A dataset in one of the engine's formats.
 
@@ -215,6 +232,8 @@ class StoredDataset(Dataset):
         }
         #: The columns that `merge_col` added.
         self._merged: dict[str, Array] = {}
+        #: The dataset with the columns that `merge_col` added, as an object of the engine.
+        self._view: Any = None
         self._keys = [name for name in self.schema if name not in NUMBERING] if keys_to_load is None else [*keys_to_load]
         self._cached = [*(keys_to_cache or [])]
         for target, source in (keys_to_merge or {}).items():
@@ -229,14 +248,25 @@ class StoredDataset(Dataset):
         return handle.cached(self._cached, 1 << 62) if self._cached else handle
 
     @property
-    def engine(self) -> Any:
-        """This dataset as an object of the engine."""
+    def _stored(self) -> Any:
+        """The stored columns, as an object of the engine."""
         if self._handle is None:
             self._handle = self._open()
         return self._handle
 
+    @property
+    def engine(self) -> Any:
+        """This dataset as an object of the engine, with the columns that `merge_col` added."""
+        if not self._merged:
+            return self._stored
+        if self._view is None:
+            base = self._stored.select([name for name in self.schema if name not in (*NUMBERING, *self._merged)])
+            added = _engine.Dataset.foreign(_Merged(dict(self._merged), self.lengths, self.offsets))
+            self._view = _engine.Dataset.merge(base, added, list(self._merged))
+        return self._view
+
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_handle": None}
+        return {**self.__dict__, "_handle": None, "_view": None}
 
     def __repr__(self) -> str:
         rows = int(self.lengths.sum())
@@ -255,18 +285,18 @@ class StoredDataset(Dataset):
     @property
     def manifest(self) -> dict[str, Any] | None:
         """The manifest (provenance) of the dataset, if it has one."""
-        text = self.engine.manifest()
+        text = self._stored.manifest()
         return None if text is None else dict(json.loads(text))
 
     def constants(self, episode_idx: int) -> dict[str, bytes]:
         """The non-numeric constants of an episode, such as the XML of its scene."""
-        return dict(self.engine.constants(int(_tensors.whole("episode_idx", episode_idx))))
+        return dict(self._stored.constants(int(_tensors.whole("episode_idx", episode_idx))))
 
     def _episode_values(self, episode: int) -> dict[str, Any]:
         wanted = episode + self.num_episodes if episode < 0 else episode
         if not 0 <= wanted < self.num_episodes:
             raise IndexError(f"episode {episode} is outside the dataset, which has {self.num_episodes} episodes")
-        return _tensors.episode_values(self.engine.constants(wanted).get(_tensors.EPISODE))
+        return _tensors.episode_values(self._stored.constants(wanted).get(_tensors.EPISODE))
 
     def _row_shape(self, name: str) -> tuple[int, ...]:
         return self._merged[name].shape[1:] if name in self._merged else self.schema[name][1]
@@ -274,7 +304,7 @@ class StoredDataset(Dataset):
     def _read(self, names: Sequence[str], episodes: Array, starts: Array, lengths: Array, skip: int) -> dict[str, Array]:
         """The concatenated rows of runs, `(rows, ...)`: every row of `action`, every `skip`-th row of other columns."""
         stored = [name for name in names if name not in self._merged]
-        found = self.engine.read(stored, *(np.ascontiguousarray(part, np.int64) for part in (episodes, starts, lengths)), skip)
+        found = self._stored.read(stored, *(np.ascontiguousarray(part, np.int64) for part in (episodes, starts, lengths)), skip)
         found = {name: array.reshape(len(array), *self.schema[name][1]) for name, array in found.items()}
         if self._merged:
             firsts = self.offsets[episodes] + starts
@@ -368,7 +398,14 @@ class StoredDataset(Dataset):
             source = [name for name in self.schema if name not in NUMBERING and pattern.match(name)]
         if not source:
             raise KeyError(f"no column of {self.path} matches the source of {target!r}")
-        self._merged[target] = np.concatenate([self.get_col_data(name) for name in source], axis=dim)
+        merged = np.concatenate([self.get_col_data(name) for name in source], axis=dim)
+        rows = int(self.lengths.sum())
+        if len(merged) != rows:
+            raise ValueError(
+                f"merge_col: the columns {', '.join(source)} joined along axis {dim} have {len(merged)} rows, expected {rows}; "
+                "choose another dim, or leave out columns of scalars"
+            )
+        self._merged[target], self._view = merged, None
         if target not in self._keys:
             self._keys.append(target)
 
@@ -391,7 +428,7 @@ class MergeDataset:
     Args:
         datasets: The datasets.
         keys_from_dataset: The columns to take from each dataset. `None` takes from each dataset the columns that no earlier
-            dataset has.
+            dataset has. A column can be taken from one dataset only.
     """
 
     def __init__(self, datasets: Sequence[Any], keys_from_dataset: Sequence[Sequence[str]] | None = None) -> None:
@@ -404,14 +441,38 @@ class MergeDataset:
         _check_same_clips("MergeDataset", self.datasets)
         if any(len(dataset) != len(self.datasets[0]) for dataset in self.datasets):
             raise ValueError("MergeDataset: the datasets must have the same num_steps and frameskip")
+        self._are_chosen = keys_from_dataset is not None
         if keys_from_dataset is None:
             seen: set[str] = set()
-            self.keys_map = []
+            self.keys_map: list[list[str]] = []
             for dataset in self.datasets:
                 self.keys_map.append([name for name in dataset.column_names if name not in seen])
                 seen.update(self.keys_map[-1])
         else:
             self.keys_map = [list(keys) for keys in keys_from_dataset]
+            self._check_keys()
+
+    def _check_keys(self) -> None:
+        """Checks that each column is taken from one dataset, which has it.
+
+        Raises:
+            KeyError: If a dataset does not have the column.
+            ValueError: If there are more or fewer lists than datasets, or a column is taken twice.
+        """
+        if len(self.keys_map) != len(self.datasets):
+            counts = f"{len(self.datasets)} datasets, got {len(self.keys_map)}"
+            raise ValueError(f"keys_from_dataset: expected a list of columns for each of {counts}")
+        names = self.column_names
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"keys_from_dataset: {', '.join(map(repr, twice))} would be taken twice; take it from one dataset")
+        for index, (dataset, keys) in enumerate(zip(self.datasets, self.keys_map, strict=True)):
+            known = list(dataset.column_names)
+            # A transform can add columns, and an empty replay buffer has none yet.
+            unknown = [name for name in keys if name not in known and known and not transforms_of(dataset)]
+            if unknown:
+                raise KeyError(
+                    f"keys_from_dataset: dataset {index} has no column {unknown[0]!r}; its columns are {', '.join(known)}"
+                )
 
     @property
     def column_names(self) -> list[str]:
@@ -430,9 +491,10 @@ class MergeDataset:
 
         merged = engine_of(self.datasets[0])
         others = {name for keys in self.keys_map[1:] for name in keys} - set(self.keys_map[0])
-        known = [name for name, _, _ in merged.schema()]
-        if not others.isdisjoint(known):
-            merged = merged.select([name for name in known if name not in others])
+        known = [name for name, _, _ in merged.schema() if name not in NUMBERING]
+        kept = [name for name in known if name in self.keys_map[0] or not (self._are_chosen or name in others)]
+        if kept != known:
+            merged = merged.select(kept)
         for dataset, keys in zip(self.datasets[1:], self.keys_map[1:], strict=True):
             merged = _engine.Dataset.merge(merged, engine_of(dataset), keys)
         return merged
@@ -635,18 +697,53 @@ class ConcatDataset:
         return {name: np.stack([row[name] for row in found]) for name in found[0]}
 
 
+def transforms_of(dataset: Any) -> list[Transform]:
+    """The transforms of a dataset, or of the datasets that it joins."""
+    if isinstance(dataset, (MergeDataset, ConcatDataset)):
+        return [transform for part in dataset.datasets for transform in transforms_of(part)]
+    transform = getattr(dataset, "transform", None)
+    return [] if transform is None else [transform]
+
+
+def joins_episodes(dataset: Any) -> bool:
+    """Whether the transform of a sample depends on its episode, because a :class:`ConcatDataset` joins several datasets."""
+    if isinstance(dataset, MergeDataset):
+        return any(joins_episodes(part) for part in dataset.datasets)
+    return isinstance(dataset, ConcatDataset)
+
+
+def transformed(dataset: Any, sample: dict[str, Any], episode: int) -> dict[str, Any]:
+    """A sample that the engine read, with the transforms of `dataset[i]`."""
+    if isinstance(dataset, ConcatDataset):
+        parts, episodes = dataset._locate(dataset._episodes_before, [episode], "episodes")
+        return transformed(dataset.datasets[int(parts[0])], sample, int(episodes[0]))
+    if isinstance(dataset, MergeDataset):
+        columns = set(dataset.column_names)
+        found = {name: value for name, value in sample.items() if name not in columns}
+        for part, keys in zip(dataset.datasets, dataset.keys_map, strict=True):
+            own = transformed(part, {name: sample[name] for name in keys if name in sample}, episode)
+            found.update((name, own[name]) for name in keys if name in own)
+        return found
+    # The engine has scalars where some datasets have lists of one element.
+    for name, (_, shape) in getattr(dataset, "schema", {}).items():
+        if shape == (1,) and name in sample and sample[name].ndim == 1:
+            sample[name] = sample[name][:, None]
+    transform = getattr(dataset, "transform", None)
+    return sample if transform is None else dict(transform(sample))
+
+
 def _items(dataset: Any, indices: Sequence[int]) -> list[dict[str, Any]]:
     if hasattr(dataset, "__getitems__"):
         return list(dataset.__getitems__(indices))
     return [dataset[i] for i in indices]
 
 
-def _at_this_moment(dataset: Any, last: Any) -> Any:
+def at_this_moment(dataset: Any, last: Any) -> Any:
     """The dataset with the present content of its replay buffers; `last`, which this returned before, if none has changed."""
     if not isinstance(dataset, (MergeDataset, ConcatDataset)):
         return dataset._now if hasattr(type(dataset), "_now") else dataset
     before = last.datasets if type(last) is type(dataset) else [None] * len(dataset.datasets)
-    parts = [_at_this_moment(part, known) for part, known in zip(dataset.datasets, before, strict=True)]
+    parts = [at_this_moment(part, known) for part, known in zip(dataset.datasets, before, strict=True)]
     for known in (dataset, last):
         if known is not None and all(a is b for a, b in zip(parts, known.datasets, strict=True)):
             return known
@@ -727,7 +824,7 @@ class GoalDataset:
     def _clips(self) -> _GoalClips:
         """The clips that have a goal; of a replay buffer, those of its content at this moment."""
         found = self._found
-        content = _at_this_moment(self.dataset, None if found is None else found.content)
+        content = at_this_moment(self.dataset, None if found is None else found.content)
         if found is None or found.content is not content:
             lengths = np.asarray(content.lengths)
             clips = np.asarray(content.clip_indices, dtype=np.int64).reshape(-1, 2)

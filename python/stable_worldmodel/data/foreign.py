@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from typing import Any
 
 from stable_worldmodel import _engine
@@ -12,10 +15,13 @@ from stable_worldmodel import _engine
 from . import _tensors
 from ._tensors import Array
 
-__all__ = ["engine_of"]
+__all__ = ["engine_of", "left_out"]
 
 #: The number of cached slices: a conversion reads the columns of an episode one after another.
 _CACHED = 4
+
+#: Where readers note the names of texts and values of episodes, which the engine does not get.
+_LEFT_OUT: ContextVar[set[str] | None] = ContextVar("left_out", default=None)
 
 
 class _Rows:
@@ -29,6 +35,9 @@ class _Rows:
                 setattr(self._reader, name, value)
         self._cache: OrderedDict[tuple[int, int, int], dict[str, Array]] = OrderedDict()
         self._lock = threading.Lock()
+        self._left_out = _LEFT_OUT.get()
+        if self._left_out is not None and getattr(reader, "episode_column_names", None):
+            self._left_out.add(_tensors.EPISODE)
 
     def lengths(self) -> list[int]:
         return [int(length) for length in self._reader.lengths]
@@ -53,14 +62,28 @@ class _Rows:
             found = self._reader._load_slice(episode, start, end)
         else:
             content = self._reader.load_episode(episode)
-            found = {name: value if isinstance(value, str) else value[start:end] for name, value in content.items()}
+            whole = (str, bytes, Mapping)
+            found = {name: value if isinstance(value, whole) else value[start:end] for name, value in content.items()}
         # A slice has one action for each row, also for the last row of an episode.
-        arrays, _ = _tensors.rows(found)
+        arrays, constants = _tensors.rows(found)
+        if self._left_out is not None:
+            self._left_out.update(constants)
         with self._lock:
             self._cache[key] = arrays
             while len(self._cache) > _CACHED:
                 self._cache.popitem(last=False)
         return arrays
+
+
+@contextlib.contextmanager
+def left_out() -> Iterator[set[str]]:
+    """The names of texts and values of episodes that the readers opened meanwhile return, and the engine does not get."""
+    names: set[str] = set()
+    token = _LEFT_OUT.set(names)
+    try:
+        yield names
+    finally:
+        _LEFT_OUT.reset(token)
 
 
 def engine_of(dataset: Any) -> Any:

@@ -19,6 +19,7 @@ Afterwards `load_dataset`, `convert`, `Loader` and `World.collect(path, format="
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -163,6 +164,37 @@ def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode
 
 
 def foreign_writer(path: str | os.PathLike[str], format: str | None, mode: str) -> Any | None:
-    """A writer of a user-defined format; `None` for formats of the engine."""
+    """A writer of a user-defined format; `None` for formats of the engine. The mode `"resume"` appends."""
+    kind = _foreign(path, format)
+    mode = "append" if mode == "resume" else mode
+    return None if kind is None else kind.open_writer(path, mode=validate_write_mode(mode))
+
+
+def foreign_episodes(path: str | os.PathLike[str], format: str | None, mode: str) -> int:
+    """The number of episodes of a user-defined format that a collection with this mode continues after; 0 for other formats.
+
+    Raises:
+        ValueError: If the dataset cannot be read, and the collection resumes.
+    """
+    kind = _foreign(path, format)
+    if kind is None or mode not in ("resume", "append"):
+        return 0
+    text = os.fspath(path)
+    try:
+        return len(kind.open_reader(path).lengths)
+    except FileNotFoundError:
+        return 0
+    except Exception as error:
+        if "://" not in text and not os.path.exists(text):
+            return 0
+        why = f"{text}: the reader of the format {kind.name!r} does not tell the number of episodes ({error})"
+        if mode == "resume":
+            raise ValueError(f"{why}, so the collection cannot resume; use mode='append' or mode='overwrite'") from error
+        warnings.warn(f"{why}, so the collection starts again with its first episode; use another seed", stacklevel=3)
+        return 0
+
+
+def _foreign(path: str | os.PathLike[str], format: str | None) -> type[Format] | None:
+    """The user-defined format of a path; `None` for formats of the engine."""
     kind = get_format(format) if format is not None else detect_format(path)
-    return None if kind is None or kind.native else kind.open_writer(path, mode=validate_write_mode(mode))
+    return None if kind is None or kind.native else kind

@@ -18,11 +18,23 @@ from stable_worldmodel import _engine, _options
 
 from . import _tensors
 from ._tensors import NUMBERING, Array
-from .dataset import ConcatDataset, MergeDataset, StoredDataset, Transform
+from .dataset import (
+    ConcatDataset,
+    MergeDataset,
+    StoredDataset,
+    Transform,
+    at_this_moment,
+    joins_episodes,
+    transformed,
+    transforms_of,
+)
 from .foreign import engine_of
 from .utils import load_dataset
 
 __all__ = ["Goals", "Loader"]
+
+#: The column with the index of a clip's episode.
+_EPISODE = NUMBERING[0]
 
 atexit.register(_engine.end_loaders)
 
@@ -101,8 +113,8 @@ class Loader:
         drop_last: Whether a last batch with fewer clips is left out.
         episodes: The indices of the episodes to use, or a mask of one boolean for each episode; all episodes for `None`.
         goals: The goals to sample for every clip: one `Goals`, or several with different names.
-        transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, action_dim)`, as
-            in a dataset's `transform`.
+        transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, action_dim)`. It
+            gets what the transform of the dataset returns, which is called with every sample before, on the CPU.
         device: The device to which tensors are moved; the CPU for `None`.
         pin_memory: Whether tensors are in page-locked memory, from which a GPU copies without waiting; with `device`, before
             they are moved. Without a GPU it has no effect.
@@ -155,12 +167,16 @@ class Loader:
             raise ValueError("device: numpy arrays stay on the CPU; use backend='torch'")
         self.device = device
         self.pin_memory = bool(pin_memory) and self.backend == "torch" and _tensors.has_gpu()
-        self.transform = transform if transform is not None else getattr(dataset, "transform", None)
+        self.transform = transform
+        #: The dataset, or the content of its replay buffers, that the engine reads.
+        self._content = at_this_moment(dataset, None)
+        #: Whether the dataset, or one that it joins, has a transform of samples.
+        self._has_own = bool(transforms_of(self._content))
         self.batch_size = _options.whole("batch_size", batch_size)
         self.seed = _options.whole("seed", seed)
         if cache is None:
             cache = "512MiB" if isinstance(dataset, (StoredDataset, ConcatDataset, MergeDataset)) else 0
-        engine = engine_of(dataset)
+        engine = engine_of(self._content)
         stored = {name: tuple(shape) for name, _, shape in engine.schema()}
         if columns is None:
             columns = list(getattr(dataset, "column_names", None) or [n for n in stored if n not in NUMBERING])
@@ -169,6 +185,14 @@ class Loader:
         unknown = [name for name in columns if name not in stored]
         if unknown:
             raise KeyError(f"there is no column {unknown[0]!r}; the columns are {', '.join(stored)}")
+        joins = self._has_own and joins_episodes(dataset)
+        if joins and (_EPISODE not in stored or engine.episode_indices().tolist() != list(range(len(engine.lengths())))):
+            raise ValueError(
+                "transform: the episodes of the joined datasets are not numbered from 0, so the transform of a clip is "
+                "unknown; use torch's DataLoader"
+            )
+        #: Whether batches of the engine have the episodes of clips only to find their transforms.
+        self._adds_episodes = joins and _EPISODE not in columns
         given = [goals] if isinstance(goals, Goals) else list(goals or [])
         num_steps = num_steps if num_steps is not None else getattr(dataset, "num_steps", 1)
         frameskip = frameskip if frameskip is not None else getattr(dataset, "frameskip", 1)
@@ -176,7 +200,7 @@ class Loader:
         settings = {
             "num_steps": self.num_steps,
             "frameskip": self.frameskip,
-            "columns": [*columns],
+            "columns": [*columns, _EPISODE] if self._adds_episodes else [*columns],
             "goals": [goal.spec() for goal in given],
             "batch_size": self.batch_size,
             "shuffle": bool(shuffle),
@@ -198,12 +222,16 @@ class Loader:
         self._loader = _engine.Loader(engine, self._settings)
         #: The shape of a row of every column: the axes after the batch and the steps.
         self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
+        if self._adds_episodes:
+            del self._shapes[_EPISODE]
         # The dataset returns some scalar columns as lists of one element, so the loader returns such lists, too.
         for name, (_, shape) in getattr(dataset, "schema", {}).items():
             for column in (name, *(f"{goal.name}_{name}" for goal in given)):
                 if name != "action" and self._shapes.get(column) == () and shape == (1,):
                     self._shapes[column] = shape
         self._action = stored.get("action")
+        #: A batch without samples, as the transform of the dataset returns it.
+        self._empty: dict[str, Any] | None = None
         #: The epoch and batch at which the next iteration starts.
         self._next = (0, 0)
         #: The epoch and batch that the latest iteration has reached.
@@ -211,11 +239,12 @@ class Loader:
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes with the position of the iteration; the process that unpickles opens the dataset again."""
-        return {**self.__dict__, "_loader": None}
+        return {**self.__dict__, "_loader": None, "_content": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._loader = _engine.Loader(engine_of(self.dataset), self._settings)
+        self._content = at_this_moment(self.dataset, None)
+        self._loader = _engine.Loader(engine_of(self._content), self._settings)
 
     def __len__(self) -> int:
         """The number of batches in an epoch, on every rank."""
@@ -268,34 +297,92 @@ class Loader:
     def _batches(self, epoch: int, batch: int) -> Iterator[dict[str, Any]]:
         shaped = map(self._shaped, iter(self._loader.epoch(epoch, batch).next, None))
         # Page-locked memory is filled while the batch before is used. A transform runs in the thread of its user.
-        for value in _ahead(shaped) if self.pin_memory and self.device is not None and self.transform is None else shaped:
+        plain = self.transform is None and not self._has_own
+        for value in _ahead(shaped) if self.pin_memory and self.device is not None and plain else shaped:
             batch += 1
             self._at = (epoch, batch) if batch < len(self) else (epoch + 1, 0)
             yield value
 
     def _shaped(self, found: dict[str, Array]) -> dict[str, Any]:
         batch: dict[str, Any] = {}
+        episodes = found.pop(_EPISODE) if self._adds_episodes else found.get(_EPISODE)
         for name, array in found.items():
             shape = self._shapes[name]
             if shape == (1,) and array.ndim == 2:
                 array = array[..., np.newaxis]
-            value = _tensors.wrap(_tensors.channels_first(array, shape), self.backend)
-            value = value.pin_memory() if self.pin_memory else value
-            batch[name] = value if self.device is None else value.to(self.device, non_blocking=True)
-        if self.transform is None:
-            return batch
+            batch[name] = _tensors.wrap(_tensors.channels_first(array, shape), self.backend)
+        if self.transform is None and not self._has_own:
+            return {name: self._placed(value) for name, value in batch.items()}
         if "action" in batch and self._action is not None:
             size = len(batch["action"])
             batch["action"] = batch["action"].reshape(size, self.num_steps * self.frameskip, *self._action)
-        batch = self.transform(batch)
+        if self._has_own:
+            batch = self._transformed(batch, episodes)
+        batch = {name: self._placed(value) for name, value in batch.items()}
+        if self.transform is not None:
+            batch = self.transform(batch)
         if "action" in batch:
             shape = batch["action"].shape
             batch["action"] = batch["action"].reshape(shape[0], self.num_steps, math.prod(shape[1:]) // self.num_steps)
         return batch
 
+    def _placed(self, value: Any) -> Any:
+        """A tensor in page-locked memory and on the device, if these are chosen; other values unchanged."""
+        if not hasattr(value, "pin_memory"):
+            return value
+        value = value.pin_memory() if self.pin_memory else value
+        return value if self.device is None else value.to(self.device, non_blocking=True)
+
+    def _transformed(self, batch: dict[str, Any], episodes: Array | None) -> dict[str, Any]:
+        """The batch of the samples that the transform of the dataset returns."""
+        size = len(next(iter(batch.values())))
+        if size == 0:
+            if self._empty is None:
+                raise ValueError(
+                    "transform: this process got no samples of the first batch, so the columns that the dataset's transform "
+                    "returns are unknown; use drop_last=True, a larger dataset, or a smaller world_size"
+                )
+            return dict(self._empty)
+        views = [{name: column[i] for name, column in batch.items()} for i in range(size)]
+        numbers = [0] * size if episodes is None else episodes.reshape(size, -1)[:, 0].tolist()
+        samples = [transformed(self._content, dict(view), number) for view, number in zip(views, numbers, strict=True)]
+        names = list(samples[0])
+        if other := next((list(sample) for sample in samples if sample.keys() != samples[0].keys()), None):
+            raise ValueError(f"transform: the samples of a batch need the same columns, got {names} and {other}")
+        found = {}
+        for name in names:
+            values = [sample[name] for sample in samples]
+            # A column that the transform keeps is not copied.
+            kept = name in batch and all(value is view[name] for value, view in zip(values, views, strict=True))
+            found[name] = batch[name] if kept else self._stacked(name, values)
+        if self._empty is None:
+            self._empty = {name: _without_samples(value) for name, value in found.items()}
+        return found
+
+    def _stacked(self, name: str, values: list[Any]) -> Any:
+        """The values of a column along a new first axis."""
+        try:
+            if self.backend == "numpy":
+                return np.stack([np.asarray(value) for value in values])
+            from torch.utils.data import default_collate
+
+            return default_collate(values)
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"transform: the samples' values of {name!r} cannot be stacked to a batch ({error}); return arrays of one "
+                "shape, or use torch's DataLoader with a collate_fn"
+            ) from error
+
     def __repr__(self) -> str:
         clips = f"{self.num_clips} clips of {self.num_steps} steps, frameskip {self.frameskip}"
         return f"Loader({len(self)} batches of {self.batch_size}: {clips})"
+
+
+def _without_samples(value: Any) -> Any:
+    """The values of a batch without samples, which share no memory with it."""
+    if isinstance(value, np.ndarray):
+        return value[:0].copy()
+    return value[:0].clone() if hasattr(value, "clone") else type(value)()
 
 
 def _ahead(batches: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:

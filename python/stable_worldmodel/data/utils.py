@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from stable_worldmodel import _engine
 
 from . import _tensors
 from .dataset import Transform
-from .foreign import engine_of
+from .foreign import engine_of, left_out
 from .format import FORMATS, detect_format, get_format, validate_write_mode
 from .normalization import column_normalizer
 from .writer import codec_json
@@ -201,6 +202,8 @@ def convert(
 ) -> dict[str, Any]:
     """Writes a dataset in another format or codec, and compares the decoded contents.
 
+    A conversion from or to a user-defined format leaves out texts and values of episodes, with a warning that names them.
+
         convert("pusht.lance", "pusht.h5")
         convert("pusht.lance", "pusht-video", dest_format="video")
 
@@ -233,14 +236,30 @@ def convert(
     kind = FORMATS["lance"] if kind is None else kind
     report = _progress_callback(progress)
     if not kind.native:
-        return write_all(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report)
+        with left_out() as names:
+            written = write_all(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report, names)
+        _warn_left_out(dest, names)
+        return written
     if kind.name in ("video", "lance-video"):
         # Frames have no time; videos of datasets have a fixed rate.
         kwargs.pop("fps", None)
     if kwargs:
         raise TypeError(f"convert: the format {kind.name} takes no {', '.join(kwargs)}")
     options = _options(kind.name, mode, codec, jpeg_quality, verify, least_psnr)
-    return dict(json.loads(_engine.convert(engine_of(source), os.fspath(dest), options, report)))
+    with left_out() as names:
+        written = dict(json.loads(_engine.convert(engine_of(source), os.fspath(dest), options, report)))
+    _warn_left_out(dest, names)
+    return written
+
+
+def _warn_left_out(dest: str | os.PathLike[str], names: set[str]) -> None:
+    """Warns of the texts and values of episodes that a conversion has not written."""
+    if names:
+        warnings.warn(
+            f"{os.fspath(dest)}: {', '.join(sorted(names))} are left out, because a conversion from or to a user-defined "
+            "format writes only columns of steps; write the episodes with open_writer to keep texts and values of episodes",
+            stacklevel=3,
+        )
 
 
 def merge(
@@ -286,8 +305,11 @@ def _plain(mode: str) -> str:
     return validate_write_mode("error" if mode == "resume" else mode)
 
 
-def write_all(source: Any, writer: Any, report: Callable[[str, int, int], None] | None) -> dict[str, Any]:
-    """Writes all episodes of a dataset with a writer implemented in Python."""
+def write_all(source: Any, writer: Any, report: Callable[[str, int, int], None] | None, lost: set[str]) -> dict[str, Any]:
+    """Writes all episodes of a dataset with a writer implemented in Python.
+
+    Adds the names of texts and values of episodes, which the writer does not get, to `lost`.
+    """
     engine = engine_of(source)
     lengths = engine.lengths()
     names = [name for name, _, _ in engine.schema() if name not in _tensors.NUMBERING]
@@ -295,6 +317,7 @@ def write_all(source: Any, writer: Any, report: Callable[[str, int, int], None] 
         for episode, length in enumerate(lengths):
             run = (np.asarray([value], dtype=np.int64) for value in (episode, 0, length))
             writer.write_episode(dict(engine.read(names, *run, 1)))
+            lost.update(engine.constants(episode))
             if report is not None:
                 report("convert", episode + 1, len(lengths))
     return {"episodes": len(lengths), "rows": int(lengths.sum())}

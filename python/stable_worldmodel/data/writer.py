@@ -117,7 +117,7 @@ class EpisodeWriter:
 
         Row `t` holds the observation at `t` and the action taken from it. The action of the last row is missing: NaN, -1 for
         integers, or one action fewer. An action in the last row is left out, with a warning, because no observation
-        follows it.
+        follows it. Actions of `uint8` and `bool` need all rows, and the last one is stored, with a warning.
         """
         with self._lock:
             if self._closed:
@@ -128,6 +128,9 @@ class EpisodeWriter:
             if _tensors.without_last_action(arrays) and not self._warned:
                 self._warned = True
                 warnings.warn(f"{self.path}: {_tensors.LAST_ACTION}", stacklevel=2)
+            if _tensors.keeps_last_action(arrays) and not self._warned:
+                self._warned = True
+                warnings.warn(f"{self.path}: {_tensors.LAST_ACTION_STAYS}; convert them to int32", stacklevel=2)
             known = self._columns
             if not known:
                 self._columns = {name: (array.dtype.name, array.shape[1:]) for name, array in arrays.items()}

@@ -18,7 +18,7 @@ from typing import Any
 import ray
 
 from .. import _engine
-from ..train.options import Options, settings_of
+from ..train.options import Options, called
 from .supply import WAIT_SECONDS, RunRefused
 
 __all__ = ["fit", "fitted"]
@@ -56,8 +56,7 @@ def fit(
         RunRefused: If the cluster has too little, or the processes died too often.
         ValueError: If a setting is invalid, or the folder of the checkpoint holds a run.
     """
-    more = {key: options.pop(key) for key in list(options) if "__" in key}
-    given = Options(family, os.fspath(data), os.fspath(out), settings=[*settings, *settings_of(more)], **options)
+    given = called(family, os.fspath(data), settings, {"out": os.fspath(out), **options})
     return fitted(dataclasses.replace(given, workers=workers), resources, wait)
 
 

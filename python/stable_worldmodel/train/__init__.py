@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .options import Options, parsed, settings_of
+from .options import Options, called, parsed
 
 if TYPE_CHECKING:
     from .loop import Trainer
@@ -29,8 +29,7 @@ def train(family: str, data: Any, kind: Any = None, *, settings: Any = (), **opt
         settings: Settings of the configuration, such as `["model.latent=4"]`.
         **options: The other attributes of `Options`; names with `__` are settings, such as `schedule__steps=1000`.
     """
-    more = {key: options.pop(key) for key in list(options) if "__" in key}
-    given = Options(family, str(data), settings=[*settings, *settings_of(more)], **options)
+    given = called(family, str(data), settings, options)
     if given.workers:
         if kind is not None:
             raise ValueError(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from .. import _files
 
-__all__ = ["Options", "parsed"]
+__all__ = ["Options", "called", "parsed"]
 
 #: The most threads of the engine.
 _MOST_THREADS = 1024
@@ -104,6 +104,24 @@ def parsed(family: str, arguments: Sequence[str]) -> Options:
     if "data" not in given:
         raise ValueError("data: no dataset is given; name one with data=PATH")
     return Options(family, settings=settings, **given)
+
+
+def called(family: str, data: str, settings: Iterable[str], options: Mapping[str, Any]) -> Options:
+    """The options of a call in Python, whose keyword arguments with `__` for dots are settings.
+
+    Raises:
+        TypeError: If a keyword argument is neither an option nor a setting.
+    """
+    known = [item.name for item in fields(Options) if item.name not in ("family", "data", "settings")]
+    own = {key: value for key, value in options.items() if "__" not in key}
+    for key, value in own.items():
+        if key not in known:
+            raise TypeError(
+                f"{key}: there is no such option; the options are {', '.join(known)}; "
+                f"give a setting of the configuration as settings=[{f'{key}={value}'!r}]"
+            )
+    more = {key: value for key, value in options.items() if "__" in key}
+    return Options(family, data, settings=[*settings, *settings_of(more)], **own)
 
 
 def _value(key: str, value: str, default: Any) -> Any:

@@ -79,6 +79,11 @@ class Model:
         candidates = np.ascontiguousarray(candidates, dtype=np.float32)
         if candidates.ndim != 4:
             raise ValueError(f"action_candidates: got shape {candidates.shape}, expected (B, S, H, A)")
+        if 0 in candidates.shape:
+            raise ValueError(
+                f"action_candidates: got shape {candidates.shape}, expected (B, S, H, A), each at least 1; "
+                "give at least one candidate of at least one model step"
+            )
         given = {
             key: value
             for key, value in info_dict.items()
@@ -88,6 +93,12 @@ class Model:
         # The repetitions of an info are equal, so the first one is used.
         repeated = bool(frame_dims) and max(frame_dims) == 6
         infos = {key: last_step(value[:, 0] if repeated else value) for key, value in given.items()}
+        for key, value in infos.items():
+            if len(value) != len(candidates):
+                raise ValueError(
+                    f"info_dict[{key!r}]: got {len(value)} rows, expected {len(candidates)}, one for each environment of "
+                    f"action_candidates {candidates.shape}; give infos and candidates of the same environments"
+                )
         costs = self._engine_model.cost(infos, candidates)
         if torch_in and has_torch():
             import torch
@@ -134,14 +145,18 @@ def train(
         model: A model family, such as `lewm` (`swm models` lists them).
         data: The dataset to train on, for families that learn from a dataset.
         env: The environment to train in, for families that learn online.
-        out: The checkpoint's name or path.
+        out: The checkpoint's name or path; for `None`, the name `MODEL-DATASET` or `MODEL-ENV`.
         preset: The name of a configuration; the first one of the family for `None`.
         device: `cpu`, or a GPU if the engine was built with GPU support.
         **overrides: Settings that replace the preset's settings, with `__` for dots: `schedule__steps=1000`.
 
     Returns:
-        `out`.
+        `out`, or the name that stands for `None`.
     """
+    if out is None and env is not None:
+        out = f"{model}-{env.rpartition('/')[2].partition(',')[0]}"
+    elif out is None and data is not None:
+        out = f"{model}-{Path(data).stem}"
     arguments = ["swm", "train", model]
     for flag, value in (("--data", data), ("--env", env), ("--output", out), ("--preset", preset), ("--device", device)):
         if value is not None:

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from .. import _engine, _files, _options, _progress
 from .. import spaces as swm_spaces
 from .._lazy import lazy
+from .._overrides import is_overridden
 from ..wrapper.visual import engine_wrappers
 from .env_pool import WorldEnvs
 from .metrics import Metrics
@@ -112,6 +113,9 @@ class World:
         if not (self._native or (in_engine is not None and workers)):
             from .._gym import open_world
 
+            if views:
+                problem = "only native environments without wrappers written in Python have camera views"
+                raise ValueError(f"views: {list(views)!r}; {problem}: leave them out, or leave out the wrappers")
             name, *given = env_name.split(",")
             settings = {**dict(word.split("=", 1) for word in given), **kwargs}
             self._world, self.gym_envs, self._wrapping = open_world(
@@ -141,6 +145,8 @@ class World:
         self.infos["action"] = self._actions[:, None]
         self.envs = WorldEnvs(self)
         self.policy: Any = None
+        #: Whether the engine may step with the policy without calling it.
+        self._steps_in_engine = True
         #: The seed of the episodes that `step` plays.
         self.seed: int | None = None
         self._actors: dict[int, tuple[Any, Any]] = {}
@@ -256,6 +262,7 @@ class World:
         if callable(getattr(policy, "set_env", None)):
             policy.set_env(self.envs)
         self.policy = policy
+        self._steps_in_engine = not is_overridden(policy, "get_action")
         self._drop_actor(policy)
         if getattr(policy, "seed", None) is not None and callable(getattr(policy, "set_seed", None)):
             policy.set_seed(policy.seed)
@@ -346,8 +353,10 @@ class World:
         if self.seed is None:
             self.reset()
         # A call is a few microseconds long: nothing here is called without need.
-        known = self._actors.get(id(policy))
-        actor = known[1] if known is not None and known[0] is policy else self._actor(policy)
+        actor = None
+        if self._steps_in_engine:
+            known = self._actors.get(id(policy))
+            actor = known[1] if known is not None and known[0] is policy else self._actor(policy)
         if actor is not None and isinstance(self._reset_text, str):
             begun, self._next_episode = self._world.play(actor, steps, self.seed or 0, self._next_episode, self._reset_text)
             for slot, episode in begun:
@@ -503,7 +512,7 @@ class World:
 
     def _playing(self, policy: Any) -> Any:
         """The actor of a policy for collection and evaluation. A policy implemented in Python gets an actor that calls it."""
-        actor = self._actor(policy)
+        actor = None if is_overridden(policy, "get_action") else self._actor(policy)
         if actor is not None:
             return actor
 
@@ -583,18 +592,20 @@ class World:
         policy = self._chosen(policy)
         if writer is None and format is None:
             format = _FORMAT_OF_SUFFIX.get(Path(str(path)).suffix)
+        first = 0
         if path is not None and writer is None and format not in _engine.formats():
-            from ..data.format import foreign_writer
+            from ..data.format import foreign_episodes, foreign_writer
 
-            writer = foreign_writer(path, format, "append" if mode == "resume" else mode)
+            first = foreign_episodes(path, format, mode)
+            writer = foreign_writer(path, format, mode)
         config: dict[str, Any] = {
             "episodes": episodes,
             "seed": _seed(seed),
             "variation": _options.variation(_without_states(options), self.spec["variation"]),
-            "policy": getattr(policy, "_choice", None) or _name(policy),
+            "policy": (None if is_overridden(policy, "get_action") else getattr(policy, "_choice", None)) or _name(policy),
             "action_noise": action_noise or float(getattr(policy, "action_noise", 0.0)),
             "goal": bool(goal),
-            "first": 0,
+            "first": first,
             "strict_finite": bool(strict_finite),
             "wrappers": [{"id": id, "settings": settings} for id, settings in self._wrapping],
         }
@@ -602,7 +613,9 @@ class World:
             failed: BaseException | None = None
             with writer as opened:
                 try:
-                    return self._collect(policy, None, opened, None, "create", None, config, progress)
+                    config["episodes"] = max(episodes - first, 0) if mode == "resume" else episodes
+                    counts = self._collect(policy, None, opened, None, "create", None, config, progress)
+                    return {**counts, "episodes": first + counts["episodes"]}
                 except BaseException as error:
                     failed = error
                     raise
@@ -791,7 +804,13 @@ def _joined(seeds: Sequence[int]) -> int:
 
 def _name(policy: Any) -> str:
     kind = getattr(policy, "type", None)
-    return type(policy).__name__ if kind in (None, "", "base") else str(kind)
+    # A subclass that acts otherwise is not of the kind that it inherits.
+    stated = next((made for made in type(policy).__mro__ if "type" in vars(made)), None)
+    inherits = "type" not in getattr(policy, "__dict__", {}) and str(stated and stated.__module__).startswith(
+        "stable_worldmodel."
+    )
+    own = kind in (None, "", "base") or (inherits and is_overridden(policy, "get_action"))
+    return type(policy).__name__ if own else str(kind)
 
 
 def _without_states(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:

@@ -22,6 +22,7 @@ import gymnasium
 import numpy as np
 
 from .. import _engine
+from .._overrides import is_overridden
 
 __all__ = [
     "BlurWrapper",
@@ -284,7 +285,7 @@ class ResolutionWrapper(VisualWrapper):
 
 
 def engine_wrappers(factories: Sequence[Callable[..., Any]]) -> list[tuple[str, dict[str, Any]]] | None:
-    """The ids and settings of visual wrappers made by these factories; `None` if a factory makes another kind."""
+    """Ids and settings of visual wrappers made by these factories; `None` if one makes another or is a user's subclass."""
     known = []
     for factory in factories:
         values: tuple[Any, ...] = ()
@@ -293,6 +294,8 @@ def engine_wrappers(factories: Sequence[Callable[..., Any]]) -> list[tuple[str, 
             values, settings = factory.args + values, {**factory.keywords, **settings}
             factory = factory.func
         if not (isinstance(factory, type) and issubclass(factory, VisualWrapper)):
+            return None
+        if any(is_overridden(factory, method) for method in ("__init__", "reset", "step", "render", "apply")):
             return None
         known.append((factory.id, factory.engine_settings(*values, **settings)))
     return known

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from contextvars import ContextVar
@@ -74,7 +75,7 @@ class EngineSolver:
             if engine not in known:
                 names = sorted({*self._names, *known} - set(self._names.values()))
                 raise TypeError(f"{type(self).__name__} has no setting {name!r}; it has {', '.join(names)}")
-            self.settings[engine] = value
+            self.settings[engine] = _plain(f"{type(self).__name__}: {name}", value)
         self._solved = 0
         self._action_space: spaces.Space[Any] | None = None
         #: The action space of one environment; `None` until it is asked for.
@@ -157,7 +158,10 @@ class EngineSolver:
         block, horizon, dim = config.action_block, config.horizon, self._plan_dim
         model = self.adapter()
         if model is None:
-            raise ValueError("solve: the simulator needs the environments, and solve gets infos only; use MPCPolicy")
+            raise ValueError(
+                "solve: the simulator needs the environments, and solve gets infos only; "
+                "use MPCPolicy, with a solver of this package"
+            )
         infos = {key: value for key, value in info_dict.items() if not isinstance(value, (list, str))}
         envs = len(next(iter(infos.values())))
         if isinstance(model, Adapter):
@@ -263,6 +267,21 @@ class EngineSolver:
             # Gymnasium's constructors of spaces take as long as ten iterations of a small search.
             self._single = single(self._action_space, self._n_envs)
         return self._single
+
+
+def _plain(name: str, value: Any) -> Any:
+    """A setting as JSON can hold it: numbers of numpy become those of Python.
+
+    Raises:
+        ValueError: If a number is NaN or infinite.
+    """
+    if isinstance(value, Mapping):
+        return {key: _plain(f"{name}.{key}", inner) for key, inner in value.items()}
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{name}={value}; expected a finite number")
+    return value
 
 
 def summed_costs(trace: list[dict[str, Any]], samples: int) -> list[list[float]]:

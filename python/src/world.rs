@@ -302,7 +302,8 @@ impl World {
         config: &str,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<(usize, usize, usize, Option<String>)> {
-        let settings: Collection = json("collection", config)?;
+        let Collection { episodes, seed, variation, policy: name, action_noise, goal, first, strict_finite, wrappers } =
+            json("collection", config)?;
         let mode = match mode {
             "append" => WriteMode::Append,
             "overwrite" => WriteMode::Overwrite,
@@ -313,19 +314,11 @@ impl World {
         let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let collected = exit::detached(py, || {
-            let config = CollectConfig {
-                episodes: settings.episodes,
-                seed: settings.seed,
-                variation: settings.variation,
-                policy: settings.policy,
-                action_noise: settings.action_noise,
-                goal: settings.goal,
-                first: settings.first,
-                strict_finite: settings.strict_finite,
-            };
+            let config =
+                CollectConfig { episodes, seed, variation, policy: name, action_noise, goal, first, strict_finite };
             let mut manifest = Manifest { hashes: actor.hashes.clone(), ..world.collect_manifest(&config) };
             manifest.config["codec"] = serde_json::json!(codec);
-            manifest.config["wrappers"] = settings.wrappers;
+            manifest.config["wrappers"] = wrappers;
             let schema = world.collect_schema(&config)?;
             let create = |location: &Location, mode, manifest, continues| {
                 let manifest = Some(manifest);

@@ -95,3 +95,24 @@ def test_wrapper_is_called():
     with swm.World("swm/TwoRoom-v1", 1, image_shape=(32, 32), extra_wrappers=[Dark]) as world:
         world.reset(seed=1)
         assert world.infos["pixels"].max() == 0
+
+
+def test_loader_refuses_a_dataset_whose_reading_it_would_bypass(world, tmp_path):
+    world.collect(tmp_path / "steps.h5", policy=swm.policy.RandomPolicy(), episodes=2, seed=1, progress=False)
+    stored = type(swm.data.load_dataset(tmp_path / "steps.h5"))
+
+    class Doubled(stored):
+        def __getitem__(self, index):
+            sample = super().__getitem__(index)
+            return {**sample, "state": sample["state"] * 2}
+
+    class Annotated(stored):
+        """Changes nothing that the engine reads."""
+
+        note = "mine"
+
+    doubled = Doubled(tmp_path / "steps.h5")
+    for dataset in (doubled, swm.data.ConcatDataset([doubled, doubled])):
+        with pytest.raises(TypeError, match="Doubled.__getitem__; use torch's DataLoader"):
+            swm.data.Loader(dataset, batch_size=2)
+    assert next(iter(swm.data.Loader(Annotated(tmp_path / "steps.h5"), batch_size=2, columns=["state"]))).keys() == {"state"}

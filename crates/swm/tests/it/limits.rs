@@ -136,8 +136,13 @@ impl Running {
     fn wait_for_handler(&self) {
         let handles_interrupts = || {
             let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("a process");
-            let mask = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).expect("a mask of signals");
-            u64::from_str_radix(mask.trim(), 16).expect("a number") & 2 > 0
+            let mask = |name: &str| {
+                let mask = status.lines().find_map(|line| line.strip_prefix(name)).expect("a mask of signals");
+                u64::from_str_radix(mask.trim(), 16).expect("a number")
+            };
+            // Shells start jobs in the background of scripts so, and the program leaves it.
+            assert_eq!(mask("SigIgn:") & 2, 0, "the tests run where SIGINT is ignored");
+            mask("SigCgt:") & 2 > 0
         };
         while !handles_interrupts() {
             std::thread::yield_now();

@@ -392,8 +392,12 @@ class Bridge:
         if frame is not None:
             self.render_shape = frame.shape[:2]
             self.frame_at = self.allocate(math.prod(self.render_shape) * 3)
-        goal = self.goal_frame(first) if frame is not None else None
-        self.goal_shape = goal.shape[:2] if goal is not None else None
+        goal = first.get('goal')
+        # Native environments render the goal instead.
+        self.render_goal = None
+        if frame is not None and not is_frame(goal):
+            goal = self.first_goal()
+        self.goal_shape = goal.shape[:2] if is_frame(goal) else None
         if self.goal_shape:
             self.goal_at = self.allocate(math.prod(self.goal_shape) * 3)
 
@@ -438,25 +442,23 @@ class Bridge:
                 return np.empty(shape, np.uint8)
         return None
 
-    def goal_frame(self, info):
-        """The frame of the goal: `info['goal']`, else what the environment's `render_goal` gives, as that of native environments;
-        None without either."""
-        if is_frame(info.get('goal')):
-            return info['goal'][..., :3]
+    def first_goal(self):
+        """The frame of the environment's `render_goal`, which later resets call as well; None without such a method."""
         render = getattr(self.env.unwrapped, 'render_goal', None)
-        if not callable(render):
-            return None
         try:
-            goal = render()
-        except Exception:  # Not the method of a native environment.
+            goal = render() if callable(render) else None
+        except Exception:  # Another method of this name.
             return None
-        return goal[..., :3] if is_frame(goal) else None
+        if not is_frame(goal):
+            return None
+        self.render_goal = render
+        return goal
 
     def write_goal(self, info):
-        """Writes the frame of the goal."""
+        """Writes the frame of the goal of an episode that has begun."""
         if self.goal is not None:
-            goal = self.call(self.goal_frame, info)
-            self.goal[...] = 0 if goal is None else goal
+            goal = self.call(self.render_goal) if self.render_goal else info.get('goal')
+            self.goal[...] = goal[..., :3] if is_frame(goal) else 0
 
     def describe(self):
         """The description of the environment, with offsets in the buffer, as JSON."""
@@ -542,12 +544,11 @@ class Bridge:
         for leaf, view in self.factor_views:
             value = getattr(leaf, 'value', None)
             view[...] = np.asarray(leaf.init_value if value is None else value, np.float64).reshape(-1)
-        self.write_goal(info)
         self.held = []
         self.write(observation, 0.0, False, False, info)
         if recorded is not None:
             self.set_recorded_state(**recorded)
-            self.write_goal(info)
+        self.write_goal(info)
 
     def set_recorded_state(self, calls, shown, held):
         """Sets a recorded state: calls methods of the environment, and writes the recorded values `shown` and `held` into

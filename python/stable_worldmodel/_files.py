@@ -24,7 +24,7 @@ def local(what: str, path: str | os.PathLike[str]) -> Path:
     scheme, separator, _ = os.fspath(path).partition("://")
     if separator and scheme.isalnum():
         raise ValueError(f"{what}: {os.fspath(path)!r} is a URI; expected a path of this machine")
-    return Path(path)
+    return Path(path).expanduser()
 
 
 @contextlib.contextmanager

@@ -354,7 +354,12 @@ class MPCPolicy(BasePolicy):
             return None
         # Another world may have taken the solver meanwhile.
         self.solver.configure(action_space=world.envs.action_space, n_envs=world.num_envs, config=self.cfg)
-        in_engine = self.solver.model == "simulator" or hasattr(self.solver.model, "_engine_model")
+        simulates = isinstance(self.solver.model, str) and self.solver.model == "simulator"
+        if simulates and world._wrapped_in_python:
+            raise ValueError(
+                "the simulator plays environments without wrappers written in Python; plan in a World that has none"
+            )
+        in_engine = simulates or hasattr(self.solver.model, "_engine_model")
         if world.transforms and not in_engine:
             # Transforms of frames are functions in Python, so the solver is called from here.
             return None

@@ -235,8 +235,8 @@ class Corridor(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"]}
 
-    def __init__(self, render_mode=None, length=10.0):
-        self.render_mode, self.length = render_mode, float(length)
+    def __init__(self, render_mode=None, length=10.0, title=None):
+        self.render_mode, self.length, self.title = render_mode, float(length), title
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
         self.variation_space = swm.spaces.Dict(
@@ -341,3 +341,9 @@ def test_user_defined_wrapper_changes_frames_and_rewards(corridor):
     assert np.array_equal(mixed.infos["state"], plain.infos["state"])
     difference = np.abs(255.0 - mixed.infos["pixels"] - plain.infos["pixels"])
     assert 1 < difference.mean() < 6
+
+
+@pytest.mark.parametrize("title", ["5", "true", "None", "(1, 2)", "a,b", "it's", "4x4"])
+def test_options_that_are_texts_stay_texts(corridor, title):
+    with swm.World(corridor, image_shape=(32, 32), title=title) as world:
+        assert world.gym_envs[0].unwrapped.title == title

@@ -63,3 +63,11 @@ def test_time_limit_is_that_of_the_environment(world):
 def test_camera_views_are_refused():
     with pytest.raises(ValueError, match=r"views: \['depth'\].*leave out the wrappers"):
         swm.World("swm/TwoRoom-v1", num_envs=1, image_shape=(32, 32), extra_wrappers=[Same], views=["depth"])
+
+
+def test_the_simulator_refuses_environments_in_wrappers(world):
+    solver = swm.solver.CEMSolver("simulator", num_samples=4, n_steps=1, topk=2)
+    world.set_policy(swm.policy.WorldModelPolicy(solver, swm.PlanConfig(horizon=2, receding_horizon=1)))
+    world.reset(seed=0)
+    with pytest.raises(ValueError, match="without wrappers written in Python"):
+        world.step()

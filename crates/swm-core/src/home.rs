@@ -12,11 +12,16 @@ const NOWHERE: &str = "/dev/null/assets";
 /// When neither `STABLEWM_HOME` nor `HOME` is set. The current folder is no substitute: data would go to wherever the
 /// program happens to run.
 pub fn folder() -> Result<PathBuf> {
-    let user = || variable("HOME").map(|home| home.join(".stable_worldmodel"));
+    let user = || of_user().map(|home| home.join(".stable_worldmodel"));
     variable("STABLEWM_HOME").or_else(user).ok_or_else(|| {
         let fix = "set STABLEWM_HOME to the folder of datasets and checkpoints";
         Error::config("home folder", "neither STABLEWM_HOME nor HOME is set", fix)
     })
+}
+
+/// Returns the home folder of the user, `$HOME`.
+pub fn of_user() -> Option<PathBuf> {
+    variable("HOME")
 }
 
 /// Returns the folder of assets: `$SWM_ASSETS`, else `assets` in the home folder.

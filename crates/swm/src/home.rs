@@ -293,12 +293,16 @@ pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
 }
 
 /// Returns `given` unchanged if it is a path, and the entry of `folder` with this suffix if it is a name. A text is a
-/// path if it contains a folder or an extension, or if a file of this name exists.
+/// path if it contains a folder or an extension, or if a file of this name exists. A path of `~/` is one in the user's home, which a
+/// shell replaces only at the start of a word.
 ///
 /// # Errors
 /// When it is a name and there is no folder.
 fn named(given: &str, folder: fn() -> Result<PathBuf>, suffix: &str) -> Result<PathBuf> {
     let path = Path::new(given);
+    if let (Ok(below), Some(user)) = (path.strip_prefix("~"), swm_core::home::of_user()) {
+        return Ok(user.join(below));
+    }
     // A name has no slash, not even at its end.
     if given.contains(std::path::is_separator) || path.extension().is_some() || path.exists() {
         return Ok(path.to_owned());
@@ -317,6 +321,9 @@ mod tests {
         assert_eq!(dataset("a/b.lance"), Path::new("a/b.lance"));
         assert_eq!(dataset("./b"), Path::new("./b"));
         assert_eq!(dataset("b/"), Path::new("b/"));
+        let user = swm_core::home::of_user().expect("a user's home");
+        assert_eq!(dataset("~/a/b.lance"), user.join("a/b.lance"));
+        assert_eq!(dataset("~b.lance"), Path::new("~b.lance"));
         assert_eq!(dataset("rooms"), datasets.join("rooms.lance"));
         let target = |name, format| target(name, format).expect("a location").to_string();
         assert_eq!(target("rooms", Some("hdf5")), datasets.join("rooms.h5").to_string_lossy());

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import os
@@ -98,6 +99,8 @@ class World:
         if isinstance(views, str):
             raise TypeError(f"views: {views!r}; expected a list, such as [{views!r}]")
         kwargs.pop("render_mode", None)
+        if not self._is_native(env_name):
+            kwargs = {key: _literal(value) for key, value in kwargs.items()}
         self.env_name = ",".join([env_name, *(f"{key}={value}" for key, value in kwargs.items())])
         self.num_envs = num_envs
         image = None
@@ -105,6 +108,8 @@ class World:
             image = (_options.count("image_shape", image_shape[0]), _options.count("image_shape", image_shape[1]))
         wrappers = [*(pre_wrappers or []), *(extra_wrappers or [])]
         in_engine = engine_wrappers(wrappers)
+        #: Whether wrappers written in Python change the environments.
+        self._wrapped_in_python = in_engine is None
         self._native = in_engine is not None and self._is_native(env_name)
         #: The Gymnasium environments of this world that run in this interpreter.
         self.gym_envs: list[Any] = []
@@ -780,6 +785,18 @@ def _groups(key: str) -> list[str]:
     """The groups that contain a factor: `a` and `a.b` for `a.b.c`."""
     parts = key.split(".")
     return [".".join(parts[:end]) for end in range(1, len(parts))]
+
+
+def _literal(value: Any) -> Any:
+    """A text in quotes where the id of an environment would read it as something else, such as `"5"` as a number."""
+    if not isinstance(value, str):
+        return value
+    try:
+        ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        is_text = value not in ("true", "false", "none") and not any(sign in value for sign in ",'\"()[]{}")
+        return value if is_text else repr(value)
+    return repr(value)
 
 
 def _random_seed() -> int:

@@ -181,6 +181,10 @@ impl Registry<EnvEntry> {
             })?;
             chosen.choices.0[index].1 = value;
         }
+        // Experts of other tasks are none of this environment.
+        if !chosen.entry.experts.iter().all(|expert| expert.plays(&chosen.choices)) {
+            chosen.entry.experts = &[];
+        }
         Ok(chosen)
     }
 }
@@ -192,8 +196,18 @@ pub struct ExpertEntry {
     pub id: &'static str,
     /// The expert's behaviour, in a sentence.
     pub summary: &'static str,
+    /// The values of the option `task` whose rewards the expert earns; empty for an expert that reaches the goals of every task.
+    pub tasks: &'static [&'static str],
     /// The constructor of an expert for one environment.
     pub make: fn() -> Box<dyn Expert>,
+}
+
+impl ExpertEntry {
+    /// Whether the expert plays an environment with these options.
+    fn plays(&self, choices: &Choices) -> bool {
+        let task = choices.0.iter().find(|(key, _)| *key == "task");
+        self.tasks.is_empty() || task.is_some_and(|(_, task)| self.tasks.contains(task))
+    }
 }
 
 impl Named for ExpertEntry {

@@ -16,11 +16,13 @@ pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "straight to the target, compensating the drift, or around drift that is too strong",
+        tasks: &[],
         make: || Box::new(SteeringExpert { plan: None }),
     },
     ExpertEntry {
         id: "explore",
         summary: "a smooth random walk through all zones",
+        tasks: &[],
         make: || Box::new(Explorer::<ZoneWalk>::new()),
     },
 ];

@@ -15,11 +15,13 @@ pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "the shortest way to the goal, around the walls",
+        tasks: &[],
         make: || Box::new(ShortestPathExpert { planner: None }),
     },
     ExpertEntry {
         id: "explore",
         summary: "a smooth random walk around the walls and into them",
+        tasks: &[],
         make: || Box::new(Explorer::<MazeWalk>::new()),
     },
 ];

@@ -21,11 +21,13 @@ const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "pushes planned with the environment's own physics",
+        tasks: &[],
         make: || Box::new(OnGrid(expert::Pusher::new(rounded, expert::Pace::FULL))),
     },
     ExpertEntry {
         id: "weak",
         summary: "random actions that stay near the block",
+        tasks: &[],
         make: || Box::new(OnGrid(expert::WeakExpert::default())),
     },
 ];

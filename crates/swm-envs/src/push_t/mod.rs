@@ -36,16 +36,19 @@ const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "pushes planned with the environment's own physics",
+        tasks: &[],
         make: || Box::new(expert::Pusher::new(|action| action, expert::Pace::FULL)),
     },
     ExpertEntry {
         id: "paper-speed",
         summary: "the pushes of `expert`, at the speed of the published demonstrations",
+        tasks: &[],
         make: || Box::new(expert::Pusher::new(|action| action, expert::Pace::PAPER)),
     },
     ExpertEntry {
         id: "weak",
         summary: "random actions that stay near the block",
+        tasks: &[],
         make: || Box::new(expert::WeakExpert::default()),
     },
 ];

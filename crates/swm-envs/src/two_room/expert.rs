@@ -16,11 +16,13 @@ pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "the shortest way to the target, through the best door",
+        tasks: &[],
         make: || Box::new(ShortestPath),
     },
     ExpertEntry {
         id: "explore",
         summary: "a smooth random walk through both rooms, the doors and against the walls",
+        tasks: &[],
         make: || Box::new(Explorer::<RoomWalk>::new()),
     },
 ];

@@ -6,7 +6,7 @@ use swm_core::{Error, ExpertEntry, Key, Result, RowRef, columns};
 
 macro_rules! expert {
     ($act:ident, $summary:literal) => {
-        &[ExpertEntry { id: "expert", summary: $summary, make: || Box::new(Controller($act)) }]
+        &[ExpertEntry { id: "expert", summary: $summary, tasks: &[], make: || Box::new(Controller($act)) }]
     };
 }
 

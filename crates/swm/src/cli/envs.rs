@@ -4,7 +4,7 @@ use super::{emit, emit_json, eprint, table};
 use crate::{ENVS, describe, gym, mujoco, zoo};
 use clap::Args;
 use serde_json::{Map, Value, json};
-use swm_core::{EnvChoice, Origin};
+use swm_core::{EnvChoice, ExpertEntry, Origin};
 use swm_mujoco::assets::Status;
 
 /// Arguments of `swm envs`.
@@ -36,7 +36,11 @@ pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
     // From the registry alone: to make a MuJoCo environment, its model is compiled.
     let trained = zoo::experts();
     let rows = ENVS.rows.iter().map(|row| {
-        let mut experts: Vec<String> = row.experts.iter().map(|expert| expert.id.to_owned()).collect();
+        let named = |expert: &ExpertEntry| match expert.tasks {
+            [] => expert.id.to_owned(),
+            tasks => format!("{},task={}", expert.id, tasks.join("|")),
+        };
+        let mut experts: Vec<String> = row.experts.iter().map(named).collect();
         if experts.is_empty() {
             let options = trained.iter().filter_map(|(_, env)| env.strip_prefix(row.id));
             experts.extend(options.map(|options| format!("expert{options}")));

@@ -119,6 +119,12 @@ fn expert_of_the_zoo_is_the_policy_of_its_environment() {
             "--overwrite",
         ]);
     }
+    // Scripted experts of some tasks do not play the others.
+    swm.fails(
+        &["eval", "expert", "--env", "swm/ManipulatorDMControl-v0,task=bring_peg", "--episodes", "2"],
+        2,
+        &["experts of bring_ball only"],
+    );
     swm.fails(
         &["eval", "expert", "--env", "swm/CartpoleDMControl-v0,task=balance", "--episodes", "2"],
         2,

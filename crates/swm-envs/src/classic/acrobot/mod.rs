@@ -19,6 +19,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     experts: &[ExpertEntry {
         id: "expert",
         summary: "applies torque in the direction of the joint's rotation, which adds energy in every step",
+        tasks: &[],
         make: || Box::new(Controller::<Acrobot>::new()),
     }],
 };

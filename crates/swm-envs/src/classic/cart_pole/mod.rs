@@ -18,6 +18,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     experts: &[ExpertEntry {
         id: "expert",
         summary: "drives the cart to the goal without letting the pole fall (state feedback)",
+        tasks: &[],
         make: || Box::new(Controller::<CartPole>::new()),
     }],
 };

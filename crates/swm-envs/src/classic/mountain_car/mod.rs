@@ -32,6 +32,7 @@ pub const CONTINUOUS: EnvEntry = EnvEntry {
 const PUMP: ExpertEntry = ExpertEntry {
     id: "expert",
     summary: "pushes in the direction of motion, so that every swing is higher than the last",
+    tasks: &[],
     make: || Box::new(Controller::<MountainCar<Discrete>>::new()),
 };
 

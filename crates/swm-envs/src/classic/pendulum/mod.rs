@@ -19,6 +19,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     experts: &[ExpertEntry {
         id: "expert",
         summary: "adds energy to the rod until state feedback can hold it upright, then holds it upright",
+        tasks: &[],
         make: || Box::new(Controller::<Pendulum>::new()),
     }],
 };

@@ -11,6 +11,7 @@ use swm_core::{Error, ExpertEntry, Key, Result, Rng, RowRef};
 pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     id: "expert",
     summary: "plans swing and balance in equations of motion of its own",
+    tasks: &[],
     make: || Box::new(Planner::default()),
 }];
 

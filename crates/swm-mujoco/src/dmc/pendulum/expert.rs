@@ -9,6 +9,7 @@ use swm_core::{Error, ExpertEntry, Key, Result, RowRef};
 pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     id: "expert",
     summary: "swings up by energy control, and balances with a PD controller",
+    tasks: &[],
     make: || Box::new(Controller),
 }];
 

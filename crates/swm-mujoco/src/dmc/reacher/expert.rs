@@ -8,6 +8,7 @@ use swm_core::{Error, ExpertEntry, Key, Result, RowRef, columns};
 pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     id: "expert",
     summary: "a PD controller that turns shoulder and wrist to the goal's angles",
+    tasks: &[],
     make: || Box::new(Controller),
 }];
 

@@ -9,6 +9,7 @@ use swm_core::{Error, ExpertEntry, Key, Result, RowRef};
 pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     id: "expert",
     summary: "moves a point from cell to cell along the shortest path; cannot control the ant",
+    tasks: &[],
     make: || Box::new(PathFollower),
 }];
 

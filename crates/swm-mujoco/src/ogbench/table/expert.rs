@@ -19,11 +19,13 @@ pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "places one cube after another, unlocks and slides drawer and window, sets the locks",
+        tasks: &[],
         make: || Box::new(TableExpert::new(1.0, 0.0)),
     },
     ExpertEntry {
         id: "paper-speed",
         summary: "the jobs of `expert`, at the speed and with the noise of OGBench's oracles",
+        tasks: &[],
         make: || Box::new(TableExpert::new(PAPER_SPEED, PAPER_NOISE)),
     },
 ];

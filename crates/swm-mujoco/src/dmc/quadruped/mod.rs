@@ -1,5 +1,7 @@
 //! Quadruped: a four-legged robot walks, runs, and fetches a ball (`dm_control/suite/quadruped.py`).
 
+mod expert;
+
 use super::domain::{Domain, InfoColumn, TaskTable, tasks};
 use super::factors;
 use super::measures::{in_frame, norm, uprightness};
@@ -18,7 +20,7 @@ use std::f64::consts::{PI, SQRT_2};
 use swm_core::{EnvEntry, Error, Factor, Result, Rng};
 
 /// The registry row of this domain.
-pub const ENTRY: EnvEntry = entry::<Quadruped>(&[]);
+pub const ENTRY: EnvEntry = entry::<Quadruped>(expert::EXPERTS);
 
 /// Indicator of an upright torso, by the vertical component of its z-axis.
 const UPRIGHT: Tolerance = Tolerance::at_least(1.0).linear(2.0, 0.0);

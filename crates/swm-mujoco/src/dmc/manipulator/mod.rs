@@ -1,6 +1,9 @@
 //! Manipulator: a planar arm with a hand brings a ball or a peg to a target, or inserts the
 //! object into a receptacle (`dm_control/suite/manipulator.py`).
 
+mod arm;
+mod expert;
+
 use super::domain::{Domain, TaskTable, tasks};
 use super::measures::distance;
 use super::model_edit::ModelEdit;
@@ -17,7 +20,7 @@ use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
 /// The registry row of this domain.
-pub const ENTRY: EnvEntry = entry::<Manipulator>(&[]);
+pub const ENTRY: EnvEntry = entry::<Manipulator>(expert::EXPERTS);
 
 /// The joints of the arm and the hand.
 const ARM: [&str; 8] =

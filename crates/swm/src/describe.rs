@@ -1,9 +1,18 @@
 //! Descriptions of environments as JSON, with the field names of Gymnasium's spaces, for `swm envs --json` and for the
 //! Python package.
 
-use crate::zoo;
+use crate::{ENVS, zoo};
 use serde_json::{Map, Value, json};
 use swm_core::{EnvEntry, EnvSpec, Named as _, Space, VariationSpace};
+
+/// Says that an environment without scripted experts has none, or which tasks they play.
+pub fn without_experts(chosen: &EnvEntry) -> String {
+    let all = ENVS.get(chosen.id).map_or(&[][..], |row| row.experts);
+    let tasks: Vec<&str> = all.iter().flat_map(|expert| expert.tasks).copied().collect();
+    let experts =
+        if tasks.is_empty() { "no experts".to_owned() } else { format!("experts of {} only", tasks.join(", ")) };
+    format!("{} has {experts}", chosen.id)
+}
 
 /// Describes a registered environment: its spec, summary, options and experts, among them one of the zoo.
 pub fn env(row: &EnvEntry, made: &EnvSpec) -> Value {

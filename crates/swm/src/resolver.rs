@@ -7,7 +7,7 @@ mod watching;
 
 pub use watching::WatchedPolicy;
 
-use crate::{home, zoo};
+use crate::{describe, home, zoo};
 use probing::FittedProbe;
 use serde::de::DeserializeOwned;
 use std::cell::RefCell;
@@ -463,14 +463,7 @@ fn find_expert(entry: &EnvEntry, name: &str) -> Result<Option<&'static ExpertEnt
     match entry.experts {
         [first, ..] if name == "expert" => Ok(Some(first)),
         [] => {
-            let all = crate::ENVS.get(entry.id).map_or(&[][..], |row| row.experts);
-            let tasks: Vec<&str> = all.iter().flat_map(|expert| expert.tasks).copied().collect();
-            let experts = if tasks.is_empty() {
-                "no experts".to_owned()
-            } else {
-                format!("experts of {} only", tasks.join(", "))
-            };
-            let hint = format!("{} has {experts}: choose random or a checkpoint", entry.id);
+            let hint = format!("{}: choose random or a checkpoint", describe::without_experts(entry));
             Err(Error::unknown("policy", name, ["random"], hint))
         }
         experts => experts.iter().find(|expert| expert.id == name).map(Some).ok_or_else(|| {

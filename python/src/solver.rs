@@ -12,6 +12,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde_json::Value;
+use std::time::{Duration, Instant};
 use swm::core::run::Control;
 use swm::core::{Error, Key, PlanProblem, PlanSpace, SearchObserver, Solver};
 use swm::plan::{BetweenIterations, SOLVERS};
@@ -46,12 +47,13 @@ pub fn make(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
 /// search traces as JSON.
 ///
 /// `low` and `high` are the bounds of the elements of a model step with continuous actions; `choices` holds the number
-/// of options of each discrete choice. `observer` reads the iterations: see [`PythonObserver`].
+/// of options of each discrete choice. `observer` reads the iterations: see [`PythonObserver`]. After `budget` seconds, the search stops
+/// with its best plan.
 ///
 /// # Shapes
 /// `infos`: `[envs, ..]`; `init` and actions: `[envs, horizon, dim]`; costs: `[envs]`.
 #[pyfunction]
-#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, call, plans=None, observer=None))]
+#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, call, plans=None, observer=None, budget=None))]
 #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
 pub fn solve<'py>(
     py: Python<'py>,
@@ -69,8 +71,11 @@ pub fn solve<'py>(
     call: u64,
     plans: Option<Vec<(u64, u64)>>,
     observer: Option<Py<PyAny>>,
+    budget: Option<f64>,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>, String)> {
     let _call = exit::Call::begin();
+    let budget = budget.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    let deadline = budget.and_then(|budget| Instant::now().checked_add(budget));
     let mut solver = make(solver, settings)?;
     let space = match &choices {
         Some(choices) => PlanSpace::Discrete { choices },
@@ -86,7 +91,7 @@ pub fn solve<'py>(
         )));
     }
     let keys: Vec<Key> = plans.iter().map(|&(first, second)| plan_key(seed).at(first).at(second)).collect();
-    let problem = PlanProblem { horizon, space, keys: &keys, init: init.as_deref(), deadline: None, observer: None };
+    let problem = PlanProblem { horizon, space, keys: &keys, init: init.as_deref(), deadline, observer: None };
     let observer = observer.map(PythonObserver::new);
     let observer = observer.as_ref().map(|observer| observer as &dyn SearchObserver);
     let mut control = Control::new().with_poll(signal_poll());

@@ -70,6 +70,7 @@ def solve(
     call: int,
     plans: Sequence[tuple[int, int]] | None = None,
     observer: Any = None,
+    budget: float | None = None,
 ) -> tuple[_Array, _Array, str]: ...
 
 class World:

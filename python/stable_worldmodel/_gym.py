@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from . import _engine
-from .wrapper.visual import engine_wrappers
+from .wrapper.visual import VisualWrapper, engine_wrappers
 
 #: Only one thread loads the module of the bridge: Python lists a module before its code has run.
 _LOADING = threading.RLock()
@@ -21,13 +21,14 @@ def open_world(
     wrappers: Sequence[Callable[..., Any]],
     image: tuple[int, int] | None,
     max_episode_steps: int | None,
-    resample: Any,
+    nearest: bool | None,
     threads: int,
     wrap_goal: bool,
 ) -> tuple[Any, list[Any], list[Any]]:
     """Creates a world of Gymnasium environments.
 
     If all wrappers are visual wrappers of this package, they run in the engine. Otherwise all wrappers run in Python.
+    `nearest` is the interpolation that resizes frames: see `is_nearest`.
 
     Returns:
         The engine's world, the list of its Gymnasium environments (the world appends each one that it creates), and the
@@ -51,9 +52,15 @@ def open_world(
             raise _missing(error.args[0], error) from error
         if max_episode_steps is not None:
             made.max_episode_steps = max_episode_steps
-        if resample is not None:
-            made.env.unwrapped.pixel_art = str(resample).lower() in ("nearest", "0")
+        if nearest is not None:
+            made.env.unwrapped.swm_pixel_art = nearest
         envs.append(made.env)
+        if wrap_goal and in_python and any(isinstance(layer, VisualWrapper) for layer in _layers(made.env)):
+            made.env.close()
+            raise ValueError(
+                "wrap_goal: visual wrappers change the frame of the goal only in the engine, and other wrappers of this world "
+                "are written in Python, which makes all of them run in Python; leave those out, or use wrap_goal=False"
+            )
         return made
 
     described = ",".join([env_name, *(f"{key}={value}" for key, value in options.items())])
@@ -61,6 +68,28 @@ def open_world(
         described, make, num_envs, image, max_episode_steps, threads, json.dumps(in_engine or []), wrap_goal
     )
     return world, envs, in_engine or []
+
+
+def _layers(env: Any) -> Iterator[Any]:
+    """An environment with its wrappers, from the outermost to the innermost."""
+    while env is not None:
+        yield env
+        env = getattr(env, "env", None)
+
+
+def is_nearest(resample: Any) -> bool | None:
+    """Whether frames are resized by the nearest pixel (else bilinearly); `None` if nothing is given.
+
+    Raises:
+        ValueError: When it is the name or the number in Pillow of another interpolation.
+    """
+    if resample is None:
+        return None
+    name = str(getattr(resample, "name", resample)).lower()
+    # The numbers are those of Pillow's filters.
+    if name not in ("nearest", "0", "bilinear", "2"):
+        raise ValueError(f"image_resample: {resample!r}; expected 'bilinear' or 'nearest', or None for that of the environment")
+    return name in ("nearest", "0")
 
 
 def _missing(package: str, error: Exception) -> ModuleNotFoundError:

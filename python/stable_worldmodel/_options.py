@@ -106,7 +106,8 @@ def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[st
     """The variation request in `options`.
 
     Args:
-        options: The options of a reset. Colours are integers from 0 to 255, or fractions from 0 to 1.
+        options: The options of a reset. A colour of floats that are all from 0 to 1 has fractions, so `[1.0, 0.0, 0.0]` is
+            red; other colours have values from 0 to 255, so `[1, 0, 0]` is almost black.
         spaces: The descriptions of the environment's factors, by key.
 
     Returns:
@@ -198,7 +199,7 @@ def _numbers(name: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _floats(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:
     values = _numbers(f"options['variation_values'][{key!r}]", value)
-    fractions = np.any(values != np.round(values)) and np.all((values >= 0) & (values <= 1))
+    fractions = np.asarray(value).dtype.kind == "f" and np.all((values >= 0) & (values <= 1))
     if space is not None and space["type"] == "RGBBox" and fractions:
         values = np.round(255 * values)
     found: list[float] = values.tolist()

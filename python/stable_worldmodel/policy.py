@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import _engine, _options
-from ._overrides import is_overridden
+from ._overrides import engine_part, is_overridden
 from .buffer import HistoryBuffer
 from .planning.adapter import has_torch, prepared
-from .planning.solver.engine import PLANS, EngineSolver, NotConfigured, single
+from .planning.solver.engine import ACTION_SCALER, PLANS, EngineSolver, NotConfigured, single
 
 if TYPE_CHECKING:
     from .world import World
@@ -221,6 +222,13 @@ class MixturePolicy(_EnginePolicy):
         return [{"name": name, "weight": weight} for name, weight in self.weights.items()]
 
     def _actor(self, world: World) -> Any:
+        own = _engine.Actor.experts(world.env_name) if world.env_name.partition(",")[0] in _engine.envs() else []
+        models = [name for name in self.weights if name not in ("random", "expert", *own)]
+        if world.transforms and models:
+            raise ValueError(
+                f"MixturePolicy: {models[0]} acts in the engine, which does not call the world's image_transform and "
+                "goal_transform; leave them out, or play it as a FeedForwardPolicy"
+            )
         return _engine.Actor.mixture(world._world, json.dumps(self._choice))
 
 
@@ -232,6 +240,9 @@ class FeedForwardPolicy(BasePolicy):
         process: Scalers by column; the scaler of `action` converts actions back (`inverse_transform`). `None` for those of
             the model (`model.process`), which torch modules of checkpoints have.
         transform: Transforms of frames by column, called with one frame `(C, H, W)` at a time.
+
+    Raises:
+        ValueError: If a checkpoint of the engine, which scales its inputs itself, is given with `process` or `transform`.
     """
 
     type = "feed_forward"
@@ -244,20 +255,38 @@ class FeedForwardPolicy(BasePolicy):
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
+        model = os.fspath(model) if isinstance(model, os.PathLike) else model
         self.model, self.process, self.transform = model, _process(process, model), dict(transform or {})
+        if self._checkpoint() is not None and (self.process or self.transform):
+            raise ValueError(
+                "FeedForwardPolicy: checkpoints of the engine scale their inputs themselves; remove process and transform"
+            )
         if hasattr(model, "eval") and not isinstance(model, str):
             model.eval()
 
+    def _checkpoint(self) -> str | None:
+        """The name or path of the checkpoint that acts; `None` for a model in Python."""
+        return self.model if isinstance(self.model, str) else engine_part(self.model, "_engine_policy", "get_action")
+
     def _actor(self, world: World) -> Any:
-        name = self.model if isinstance(self.model, str) else getattr(self.model, "_engine_policy", None)
-        return None if name is None else _engine.Actor.checkpoint(world._world, name)
+        name = self._checkpoint()
+        # Transforms of frames are functions in Python, so the checkpoint is called from here.
+        return None if name is None or world.transforms else _engine.Actor.checkpoint(world._world, name)
 
     def get_action(self, info_dict: Any, **kwargs: Any) -> Any:  # type: ignore[override]
         """The actions `(num_envs, ..)` for infos `(num_envs, T, ..)`."""
-        if isinstance(self.model, str) or hasattr(self.model, "_engine_policy"):
+        model = self.model
+        if self._checkpoint() is not None:
             if self.env is None:
                 raise RuntimeError("FeedForwardPolicy: it belongs to no world; call world.set_policy(policy) first")
-            return self.env._world._engine_actions(self)
+            world = self.env._world
+            if not world.transforms:
+                return world._engine_actions(self)
+            if isinstance(model, str):
+                from . import wm
+
+                # Only the transforms of frames need the checkpoint in Python.
+                model = self.model = wm.load(model)
         infos = prepared({key: value for key, value in info_dict.items() if key[0] != "_"}, self.process, self.transform)
         if "goal" in infos:
             infos["goal_pixels"] = infos["goal"]
@@ -265,15 +294,15 @@ class FeedForwardPolicy(BasePolicy):
             import torch
 
             try:
-                device = next(self.model.parameters()).device
+                device = next(model.parameters()).device
             except (AttributeError, StopIteration, TypeError):
                 device = torch.device("cpu")
             infos = {key: value.to(device) if torch.is_tensor(value) else value for key, value in infos.items()}
             with torch.inference_mode():
-                action = self.model.get_action(infos)
+                action = model.get_action(infos)
             action = action.cpu().numpy() if torch.is_tensor(action) else np.asarray(action)
         else:
-            action = np.asarray(self.model.get_action(infos))
+            action = np.asarray(model.get_action(infos))
         return self.process["action"].inverse_transform(action) if "action" in self.process else action
 
 
@@ -319,15 +348,16 @@ class MPCPolicy(BasePolicy):
             raise ValueError(f"PlanConfig.action_block: {config.action_block}; {model} was trained with {block}")
         self.cfg = self.config = config
         self.process, self.transform = _process(process, model), dict(transform or {})
-        #: The search traces, one dict for each plan, after `evaluate` and `collect`.
+        #: The search traces of the last `evaluate`, one dict for each plan, if the engine plans.
         self.plans: list[dict[str, Any]] = []
         self.history_keys = tuple(history_keys)
         self._actions: list[list[np.ndarray]] = []
         self._rest: dict[int, Any] = {}
         #: The past columns and the executed actions, in model units, of every environment.
         self._seen: list[HistoryBuffer] = []
-        #: The number of plans in the episode of every environment.
+        #: The number of plans in the episode of every environment, and of resets of the environments of an `EnvPool`.
         self._planned: list[int] = []
+        self._resets = np.zeros(0, np.int64)
         self._done: list[HistoryBuffer] = []
 
     @property
@@ -341,16 +371,26 @@ class MPCPolicy(BasePolicy):
         self._actions = [[] for _ in range(env.num_envs)]
         self._rest = {}
         self._planned = [0] * env.num_envs
+        self._resets = np.zeros(env.num_envs, np.int64)
         steps = max(1, (self.cfg.history_len - 1) * self.cfg.action_block)
         block = self.cfg.action_block
         self._seen = [HistoryBuffer(1, steps + 1, block) for _ in range(env.num_envs)]
         self._done = [HistoryBuffer(1, steps, block, ("action",)) for _ in range(env.num_envs)]
 
+    @property
+    def _scaler(self) -> Any:
+        """The scaler of actions: the given one, or that of the checkpoint; `None` if plans are in the environment's units."""
+        card = getattr(getattr(self.solver, "model", None), "card", None)
+        if "action" in self.process or not isinstance(card, Mapping) or "action_mean" not in card:
+            return self.process.get("action")
+        return _CheckpointScaler(card)
+
     def _actor(self, world: World) -> Any:
-        scale = _scale(self.process.get("action"))
         if not isinstance(self.solver, EngineSolver) or is_overridden(self.solver, "solve"):
             return None
-        if scale is None and "action" in self.process:
+        scaler = self._scaler
+        scale = None if scaler is None else _scale(scaler, single(world.envs.action_space, world.num_envs))
+        if scale is None and scaler is not None:
             return None
         # Another world may have taken the solver meanwhile.
         self.solver.configure(action_space=world.envs.action_space, n_envs=world.num_envs, config=self.cfg)
@@ -359,13 +399,16 @@ class MPCPolicy(BasePolicy):
             raise ValueError(
                 "the simulator plays environments without wrappers written in Python; plan in a World that has none"
             )
-        in_engine = simulates or hasattr(self.solver.model, "_engine_model")
-        if world.transforms and not in_engine:
-            # Transforms of frames are functions in Python, so the solver is called from here.
-            return None
         model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
         if isinstance(model, _engine.Model) and (self.process or self.transform):
             raise ValueError("MPCPolicy: models of swm.wm scale their inputs themselves; remove process and transform")
+        if world.transforms and not simulates:
+            if isinstance(model, _engine.Model) and self.cfg.history_len > 1:
+                raise ValueError(
+                    "MPCPolicy: models of swm.wm get no history in a world with image_transform; use history_len=1"
+                )
+            # Transforms of frames are functions in Python, so the solver is called from here.
+            return None
         cfg = asdict(self.cfg)
         cfg["history"] = cfg.pop("history_len")
         settings = json.dumps(self.solver.settings)
@@ -382,6 +425,9 @@ class MPCPolicy(BasePolicy):
         infos = dict(info_dict)
         fresh, active, episodes = (infos.pop(name, None) for name in ("_needs_flush", "_active", "_episode"))
         envs = self.env.num_envs
+        resets = getattr(self.env, "_resets", None)
+        if fresh is None and resets is not None:
+            fresh, self._resets = resets != self._resets, resets.copy()
         for i in range(envs):
             if fresh is not None and fresh[i]:
                 self._actions[i].clear()
@@ -406,7 +452,7 @@ class MPCPolicy(BasePolicy):
                 actions[i] = self._actions[i].pop(0).reshape(shape)
         if self.cfg.history_len > 1:
             units = actions.reshape(envs, -1)
-            units = np.asarray(self.process["action"].transform(units)) if "action" in self.process else units
+            units = units if self._scaler is None else np.asarray(self._scaler.transform(units))
             for i in np.flatnonzero(~over).tolist():
                 self._done[i].append({"action": units[i : i + 1].astype(np.float32)})
         return actions
@@ -454,11 +500,13 @@ class MPCPolicy(BasePolicy):
             given |= prepared({"action_history": infos["action_history"]}, {}, {})
         # So that a plan depends neither on the other environments nor on earlier episodes.
         plans = [(episode, self._planned[i]) for episode, i in zip(episodes or [], due, strict=False)]
-        token = PLANS.set(plans or None)
+        scaler = self._scaler
+        tokens = PLANS.set(plans or None), ACTION_SCALER.set(scaler)
         try:
             outcome = self.solver.solve(given, init_action=init)
         finally:
-            PLANS.reset(token)
+            PLANS.reset(tokens[0])
+            ACTION_SCALER.reset(tokens[1])
         for i in due:
             self._planned[i] += 1
         if not isinstance(outcome, Mapping) or "actions" not in outcome:
@@ -478,8 +526,8 @@ class MPCPolicy(BasePolicy):
             if not len(self._rest[i]):
                 del self._rest[i]
             steps = plan[row, : self.cfg.receding_horizon].reshape(self.cfg.receding_horizon * self.cfg.action_block, -1)
-            if "action" in self.process:
-                steps = np.asarray(self.process["action"].inverse_transform(steps))
+            if scaler is not None:
+                steps = np.asarray(scaler.inverse_transform(steps))
             self._actions[i] = [_executed(step, space) for step in steps]
 
 
@@ -508,16 +556,41 @@ def _executed(step: np.ndarray, space: Any) -> np.ndarray:
     return action
 
 
-def _scale(scaler: Any) -> tuple[list[float], list[float]] | None:
-    """The mean and standard deviation of a scaler; `None` if the scaler has neither."""
-    if scaler is None:
-        return None
-    for mean, std in (("mean", "std"), ("mean_", "scale_")):
-        if hasattr(scaler, mean) and hasattr(scaler, std):
-            values = [getattr(scaler, name) for name in (mean, std)]
+class _CheckpointScaler:
+    """The scaler of a checkpoint's actions, from its card."""
+
+    def __init__(self, card: Mapping[str, Any]) -> None:
+        self.mean, self.std = (np.asarray(card[name], dtype=np.float32) for name in ("action_mean", "action_std"))
+
+    def transform(self, actions: Any) -> Any:
+        return (actions - self.mean) / self.std
+
+    def inverse_transform(self, actions: Any) -> Any:
+        return actions * self.std + self.mean
+
+
+def _scale(scaler: Any, space: Any) -> tuple[list[float], list[float]] | None:
+    """The mean and standard deviation of a scaler; `None` if the scaler has neither, or does not convert actions with them."""
+    size = int(np.prod(space.shape or (1,)))
+    for names in (("mean", "std"), ("mean_", "scale_")):
+        if all(getattr(scaler, name, None) is not None for name in names):
+            values = [getattr(scaler, name) for name in names]
             values = [n.detach().cpu().numpy() if hasattr(n, "detach") else n for n in values]
-            return tuple(np.asarray(n, dtype=np.float32).reshape(-1).tolist() for n in values)  # type: ignore[return-value]
+            try:
+                mean, std = (np.broadcast_to(np.asarray(n, dtype=np.float32).reshape(-1), size) for n in values)
+                given = np.outer(_PROBES, np.ones(size, np.float32))
+                back = np.asarray(scaler.inverse_transform(given), dtype=np.float32)
+                there = np.asarray(scaler.transform(given), dtype=np.float32)
+            except (TypeError, ValueError, AttributeError):
+                return None
+            is_linear = np.all(std > 0) and np.allclose(back, given * std + mean, 1e-4, 1e-5)
+            is_linear = is_linear and np.allclose(there, (given - mean) / std, 1e-4, 1e-5)
+            return (mean.tolist(), std.tolist()) if is_linear else None
     return None
+
+
+#: Values at which a scaler shows whether it is what its mean and deviation say.
+_PROBES = np.array([-7.3, -2.1, -1.0, -0.4, 0.0, 0.3, 0.9, 1.7, 5.2], np.float32)
 
 
 def AutoCostModel(run_name: str, cache_dir: Any = None) -> Any:

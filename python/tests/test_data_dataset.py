@@ -99,6 +99,17 @@ def test_merged_columns_replace_stored_ones_everywhere(stored, tmp_path):
         dataset.merge_col(["state", "state"], "long", dim=0)
 
 
+def test_columns_are_copies(stored):
+    path, *_ = stored
+    dataset = data.load_dataset(path, backend="numpy", keys_to_cache=["reward"], keys_to_merge={"both": ["action", "state"]})
+    for name in ("both", "state", "reward"):
+        before = dataset[3][name].copy()
+        column = dataset.get_col_data(name)
+        column[:] = 100
+        np.testing.assert_array_equal(dataset[3][name], before)
+        assert (dataset.get_col_data(name) != 100).any()
+
+
 def test_transform_gets_rows_before_frameskip_joins_actions(stored):
     path, _, _ = stored
     seen = []

@@ -136,6 +136,70 @@ def test_goals_of_a_buffer_are_those_of_its_content_now():
     assert len(pickle.loads(pickle.dumps(goals))) == len(goals)
 
 
+class Marked(data.ReplayBuffer):
+    """A buffer that returns its mark in place of the rows."""
+
+    mark = 5
+
+    def __getitem__(self, idx):
+        return {**super().__getitem__(idx), "row": np.full(self.num_steps, self.mark)}
+
+    def _load_slice(self, ep_idx, start, end):
+        return {**super()._load_slice(ep_idx, start, end), "row": np.full(1, self.mark + 1)}
+
+
+def test_methods_of_a_derived_buffer_are_called_or_refused(tmp_path):
+    buffer = Marked(100, history_len=2)
+    buffer.write_episode(numbered(6))
+    for dataset in (buffer, data.ConcatDataset([buffer]), data.MergeDataset([data.ConcatDataset([buffer, buffer])])):
+        assert data.ConcatDataset([dataset])[0]["row"].tolist() == [5, 5]
+        goals = data.GoalDataset(dataset, goal_keys={"row": "goal"}, seed=0)
+        clips = len(goals)
+        assert (goals[0]["row"].tolist(), goals[0]["goal"].tolist()) == ([5, 5], [6])
+        buffer.mark = 7
+        assert (goals[0]["row"].tolist(), goals[0]["goal"].tolist()) == ([7, 7], [8])
+        buffer.mark = 5
+        buffer.write_episode(numbered(6))
+        assert len(goals) > clips and goals[clips]["row"].tolist() == [5, 5]
+        with pytest.raises(TypeError, match="Loader: .* Marked.__getitem__; use torch's DataLoader"):
+            data.Loader(dataset, batch_size=2)
+        with pytest.raises(TypeError, match="convert: .* Marked.__getitem__; write the episodes .* open_writer"):
+            data.convert(dataset, tmp_path / "copy.h5", progress=False)
+    assert not (tmp_path / "copy.h5").exists()
+
+
+def test_a_derived_buffer_that_reads_the_same_is_loaded_and_converted(tmp_path):
+    class Named(data.ReplayBuffer):
+        name = "mine"
+
+    buffer = Named(100, history_len=2, transform=lambda sample: {"row": sample["row"] * 2})
+    buffer.write_episode(numbered(6))
+    assert next(iter(data.Loader(buffer, batch_size=1, shuffle=False, backend="numpy")))["row"].tolist() == [[0, 2]]
+    assert len(data.GoalDataset(buffer, goal_keys={"row": "goal"})) == 4
+    data.convert(buffer, tmp_path / "copy.h5", progress=False)
+    assert data.load_dataset(tmp_path / "copy.h5", backend="numpy").get_col_data("row").tolist() == [*range(6)]
+
+
+def test_a_buffer_keeps_few_samplers():
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episode(numbered(20))
+    first = buffer.sample(3, step=0)
+    kept = next(iter(buffer._samplers.values()))
+    for size in range(4, 40):
+        buffer.sample(size)
+        # The one that is used stays.
+        np.testing.assert_array_equal(buffer.sample(3, step=0)["row"], first["row"])
+    assert len(buffer._samplers) == 4 and kept in buffer._samplers.values()
+    for steps in range(1, 10):
+        buffer.sample(4, steps)
+    assert kept not in buffer._samplers.values()
+    np.testing.assert_array_equal(buffer.sample(3, step=0)["row"], first["row"])
+    again = pickle.loads(pickle.dumps(buffer))
+    np.testing.assert_array_equal(again.sample(3, step=0)["row"], first["row"])
+    buffer.clear()
+    assert not buffer._samplers
+
+
 def test_writer_that_suppresses_its_error_collects_nothing_elsewhere(tmp_path, monkeypatch):
     monkeypatch.setenv("STABLEWM_HOME", str(tmp_path))
 

@@ -2,9 +2,11 @@
 
 import json
 import os
+import pathlib
 import signal
 import subprocess
 import sys
+import time
 
 import gymnasium
 import numpy as np
@@ -17,6 +19,8 @@ torch.set_num_threads(1)
 
 from stable_worldmodel import _engine  # noqa: E402
 from stable_worldmodel import solver as solvers  # noqa: E402
+from stable_worldmodel.planning.solver.callbacks import Callback  # noqa: E402
+from stable_worldmodel.world.env_pool import EnvPool  # noqa: E402
 
 BOX = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
 CHOICES = gymnasium.spaces.Discrete(3)
@@ -695,3 +699,123 @@ def test_plans_from_python_depend_on_the_episode_alone():
         for again in (played(one), played(four)):
             for actions, of_first in zip(again, expected, strict=True):
                 np.testing.assert_array_equal(actions, of_first)
+
+
+class Nearest:
+    """The cost of a candidate is its distance from 0.95 in the environment, of actions in units of a quarter."""
+
+    def get_cost(self, infos, candidates):
+        return ((candidates - 0.95 / 0.25) ** 2).sum((2, 3))
+
+
+def executed(solver, process=None, settings=None, **world):
+    """The first action that is executed."""
+    with swm.World("swm/TwoRoom-v1", 1, image_shape=(32, 32), **world) as world:
+        config = swm.PlanConfig(horizon=1, receding_horizon=1, **(settings or {}))
+        world.set_policy(swm.policy.MPCPolicy(solver, config, process=process))
+        world.reset(seed=0)
+        world.step()
+        return world.infos["action"][0, 0].copy()
+
+
+def test_plans_from_python_have_the_bounds_of_scaled_actions():
+    scaler = swm.data.ZScoreScaler(np.zeros(2), np.full(2, 0.25))
+    for world in ({}, {"image_transform": lambda frame: frame}):
+        solver = solvers.MPPISolver(Nearest(), num_samples=128, n_steps=20, seed=0)
+        assert np.allclose(executed(solver, {"action": scaler}, **world), 0.95, atol=0.05)
+
+
+def test_scaler_converts_actions_itself_where_it_is_not_its_mean_and_deviation():
+    class Bent(swm.data.ZScoreScaler):
+        def transform(self, actions):
+            return np.arctanh(np.clip(actions, -0.99, 0.99))
+
+        def inverse_transform(self, actions):
+            return np.tanh(actions)
+
+    class Half:
+        def get_cost(self, infos, candidates):
+            return ((candidates - 0.5) ** 2).sum((2, 3))
+
+    solver = solvers.CEMSolver(Half(), num_samples=64, n_steps=20, topk=8, seed=0)
+    assert np.allclose(executed(solver, {"action": Bent(np.zeros(2), np.ones(2) / 2)}), np.tanh(0.5), atol=0.02)
+
+
+@pytest.mark.parametrize("world", [{}, {"image_transform": lambda frame: frame}])
+def test_searches_end_after_their_budget(world):
+    class Slow:
+        calls = 0
+
+        def get_cost(self, infos, candidates):
+            self.calls += 1
+            time.sleep(0.05)
+            return (candidates**2).sum((2, 3))
+
+    model = Slow()
+    executed(solvers.CEMSolver(model, num_samples=8, n_steps=200, topk=2), settings={"latency_budget": 0.1}, **world)
+    assert model.calls < 100
+
+
+def test_transforms_of_frames_reach_the_models_of_the_engine():
+    actions = []
+    for function in (lambda frame: frame, lambda frame: np.zeros_like(np.asarray(frame))):
+        model = swm.wm.load("zoo:two-room/pldm")
+        solver = solvers.CEMSolver(model, num_samples=32, n_steps=2, topk=4, seed=0)
+        with swm.World("swm/TwoRoom-v1", 1, image_shape=(64, 64), image_transform=function) as world:
+            config = swm.PlanConfig(horizon=1, receding_horizon=1, action_block=model.action_block)
+            world.set_policy(swm.policy.MPCPolicy(solver, config))
+            world.reset(seed=1)
+            world.step()
+            actions.append(world.infos["action"].copy())
+            world.set_policy(swm.policy.MixturePolicy({"random": 1, "zoo:cartpole-swingup/expert": 1}))
+            with pytest.raises(ValueError, match="image_transform"):
+                world.step()
+    assert not np.allclose(*actions, atol=1e-2)
+
+
+def test_checkpoints_that_act_take_paths_and_no_scalers(tmp_path):
+    model = swm.wm.load("zoo:cartpole-swingup/expert")
+    path = pathlib.Path(model.path)
+    assert swm.policy.FeedForwardPolicy(path).model == os.fspath(path)
+    for given in ({"process": {"action": swm.data.ZScoreScaler(np.zeros(1), np.ones(1))}}, {"transform": {"pixels": abs}}):
+        with pytest.raises(ValueError, match="remove process and transform"):
+            swm.policy.FeedForwardPolicy(model, **given)
+
+
+def test_callbacks_of_mppi_get_the_spread_of_the_candidates():
+    seen = []
+
+    class Watch(Callback):
+        def __call__(self, **state):
+            seen.append(
+                (float(np.mean(np.asarray(state["prev_var"]))), float(np.asarray(state["candidates"])[0, 1:].std(0).mean()))
+            )
+
+    solver = solvers.MPPISolver(Nearest(), num_samples=2000, n_steps=3, var_scale=0.2, seed=1, callbacks=[Watch()])
+    solver.configure(
+        action_space=gymnasium.spaces.Box(-9, 9, (2,)), n_envs=1, config=swm.PlanConfig(horizon=3, receding_horizon=1)
+    )
+    solver.solve({"x": np.zeros((1, 1, 1))})
+    assert len(seen) == 3
+    assert all(abs(given - 0.2) < 1e-6 and abs(drawn - 0.2) < 0.02 for given, drawn in seen)
+
+
+def test_plans_in_a_pool_end_with_their_episodes():
+    class Rising:
+        def get_cost(self, infos, candidates):
+            wanted = np.linspace(-0.9, 0.9, candidates.shape[2])[:, None]
+            return ((np.asarray(candidates) - wanted) ** 2).sum((2, 3))
+
+    pool = EnvPool([lambda: gymnasium.make("swm/TwoRoom-v1", image_shape=(32, 32))] * 2)
+    solver = solvers.CEMSolver(Rising(), num_samples=200, n_steps=15, topk=20, seed=0)
+    policy = swm.policy.MPCPolicy(solver, swm.PlanConfig(horizon=5, receding_horizon=5))
+    policy.set_env(pool)
+    first = []
+    for mask in (None, [True, False]):
+        _, infos = pool.reset(seed=0, mask=mask)
+        for _ in range(2):
+            first.append(policy.get_action(infos)[:, 0])
+            *_, infos = pool.step(np.stack([first[-1]] * 2, 1))
+    # The first action of a plan is -0.9; the second environment goes on with its plan.
+    expected = [[-0.9, -0.9], [-0.45, -0.45], [-0.9, 0.0], [-0.45, 0.45]]
+    assert np.allclose(first, expected, atol=0.1)

@@ -1,5 +1,7 @@
 """A user's subclass of what the engine runs is called: policies, solvers and wrappers."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -116,3 +118,86 @@ def test_loader_refuses_a_dataset_whose_reading_it_would_bypass(world, tmp_path)
         with pytest.raises(TypeError, match="Doubled.__getitem__; use torch's DataLoader"):
             swm.data.Loader(dataset, batch_size=2)
     assert next(iter(swm.data.Loader(Annotated(tmp_path / "steps.h5"), batch_size=2, columns=["state"]))).keys() == {"state"}
+
+
+def traced(method):
+    """A decorator as users write them, which keeps the name and the module."""
+
+    @functools.wraps(method)
+    def still(self, *given, **named):
+        result = method(self, *given, **named)
+        return {**result, "actions": result["actions"] * 0} if isinstance(result, dict) else result * 0
+
+    return still
+
+
+@pytest.mark.parametrize("where", ["subclass", "object", "class"])
+def test_decorated_methods_are_called(world, where, monkeypatch):
+    kind, policy = swm.policy.RandomPolicy, swm.policy.RandomPolicy(1)
+    if where == "subclass":
+        policy = type("Traced", (kind,), {"get_action": traced(kind.get_action)})(1)
+    elif where == "object":
+        policy.get_action = traced(kind.get_action).__get__(policy)
+    else:
+        monkeypatch.setattr(kind, "get_action", traced(kind.get_action))
+    world.set_policy(policy)
+    world.reset(seed=1)
+    world.step()
+    assert (world.infos["action"] == 0).all()
+
+
+class Far:
+    """The cost of a candidate is its distance from 0.7."""
+
+    def get_cost(self, infos, candidates):
+        return ((candidates - 0.7) ** 2).sum((2, 3))
+
+
+def test_decorated_solver_is_called(world):
+    kind = type("Traced", (planning.CEMSolver,), {"solve": traced(planning.CEMSolver.solve)})
+    solver = kind(Far(), num_samples=16, n_steps=1, topk=4)
+    world.set_policy(swm.policy.MPCPolicy(solver, swm.PlanConfig(horizon=1, receding_horizon=1)))
+    world.reset(seed=1)
+    world.step()
+    assert (world.infos["action"] == 0).all()
+
+
+class Delegating:
+    """Passes on what it does not have itself to a model of the engine."""
+
+    def __init__(self, model):
+        self.model, self.calls = model, 0
+
+    def __getattr__(self, name):
+        return getattr(self.__dict__["model"], name)
+
+    def get_cost(self, infos, candidates):
+        self.calls += 1
+        return self.model.get_cost(infos, candidates)
+
+
+class Counting(swm.wm.Model):
+    """A model of the engine that counts its costs."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.calls = 0
+
+    def get_cost(self, infos, candidates):
+        self.calls += 1
+        return super().get_cost(infos, candidates)
+
+
+@pytest.mark.parametrize("make", [Counting, lambda name: Delegating(swm.wm.load(name))])
+def test_cost_of_a_models_subclass_is_called_and_its_plans_are_those_of_the_model(make):
+    actions = []
+    for model in (swm.wm.load("zoo:two-room/pldm"), make("zoo:two-room/pldm")):
+        with swm.World("swm/TwoRoom-v1", 1, image_shape=(64, 64)) as world:
+            solver = planning.CEMSolver(model, num_samples=32, n_steps=2, topk=4, seed=0)
+            config = swm.PlanConfig(horizon=1, receding_horizon=1, action_block=model.action_block)
+            world.set_policy(swm.policy.MPCPolicy(solver, config))
+            world.reset(seed=1)
+            world.step()
+            actions.append(world.infos["action"].copy())
+    assert model.calls == 2
+    assert np.allclose(*actions, atol=1e-5)

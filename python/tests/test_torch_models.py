@@ -4,9 +4,11 @@ The files beside the exporters in `crates/swm-models/tests/golden` hold weights,
 published models at small sizes; the engine's models are compared with the same files.
 """
 
+import functools
 import json
 import os
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -23,7 +25,8 @@ from torch import nn  # noqa: E402
 from stable_worldmodel.wm import _weights  # noqa: E402
 from stable_worldmodel.wm.encoders import ViT  # noqa: E402
 from stable_worldmodel.wm.gcrl import module as gcrl  # noqa: E402
-from stable_worldmodel.wm.lewm.module import MLP, Embedder, Predictor  # noqa: E402
+from stable_worldmodel.wm.lewm.module import MLP, Attention, Embedder, Predictor, Transformer  # noqa: E402
+from stable_worldmodel.wm.lewm.rollout import rolls  # noqa: E402
 from stable_worldmodel.wm.prejepa.module import CausalPredictor  # noqa: E402
 
 GOLDEN = Path(__file__).parents[2] / "crates/swm-models/tests/golden"
@@ -140,6 +143,123 @@ def test_pldm_equals_the_published_model():
         wanted = parts["g"].get(name)
         if wanted is not None:
             assert (parameter.grad - wanted).abs().max() < 1e-4 * max(float(wanted.abs().max()), 0.1 * largest), name
+
+
+class Still(swm.wm.LeWM):
+    """A model whose latents never move."""
+
+    def predict(self, emb, act_emb):
+        return emb
+
+
+class Doubled(Attention):
+    def forward(self, x, causal=True):
+        return 2 * super().forward(x, causal)
+
+
+class Shifted(Transformer):
+    def forward(self, x, c=None):
+        return super().forward(x, c) + 1
+
+
+class LowRank(nn.Linear):
+    """A linear layer with an adapter, as LoRA has it."""
+
+    def forward(self, x):
+        return super().forward(x) + x.sum(-1, keepdim=True)
+
+
+def of_kind(kind, *path):
+    def change(model):
+        part = model.get_submodule(".".join(path)) if path else model
+        part.__class__ = kind
+
+    return change
+
+
+def biased(model):
+    layer = model.predictor.transformer.layers[0].attn
+    other = nn.Linear(layer.to_qkv.in_features, layer.to_qkv.out_features)
+    other.weight, other.bias.data = layer.to_qkv.weight, torch.ones_like(other.bias)
+    layer.to_qkv = other
+
+
+ATTENTION = "predictor.transformer.layers.0.attn"
+#: Changes of a model that its rollouts must follow, by what they change.
+CHANGES = {
+    "predict of a subclass": of_kind(Still),
+    "predict of an object": lambda model: setattr(model, "predict", lambda emb, act_emb: emb * 2),
+    "an attention": of_kind(Doubled, ATTENTION),
+    "a transformer": of_kind(Shifted, "predictor.transformer"),
+    "an adapter": of_kind(LowRank, ATTENTION, "to_qkv"),
+    "a bias": biased,
+    "a part that is left out": lambda model: model.predictor.transformer.layers[0].register_module("attn", nn.Identity()),
+    "the forward pass of an object": lambda model: setattr(model.get_submodule(ATTENTION), "forward", torch.ones_like),
+    "the dropout": lambda model: model.predictor.register_module("dropout", nn.Sigmoid()),
+    "a hook": lambda model: model.get_submodule(ATTENTION).register_forward_hook(lambda part, given, output: output * 3),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_rollouts_and_costs_follow_changes_of_a_model(change):
+    c, parts = recorded(GOLDEN / "lewm-small.safetensors")
+    given = parts["i"]
+    plain, model = (load(jepa(swm.wm.LeWM, c, c["dim"]), parts["w"]) for _ in range(2))
+    CHANGES[change](model)
+    model.eval()
+    envs, samples, horizon, _ = given["candidates"].shape
+    spread = lambda x: x[:, None].expand(-1, samples, *x.shape[1:])  # noqa: E731
+    infos = {"pixels": spread(given["pixels"][:envs, :1]), "goal": spread(given["goal"])}
+    with torch.no_grad():
+        rolled, unchanged = dict(infos), dict(infos)
+        costs = model.get_cost(rolled, given["candidates"])
+        plain.get_cost(unchanged, given["candidates"])
+        latents = [rolled["emb"][:, :, 0].flatten(0, 1)]
+        actions = model.action_encoder(given["candidates"].flatten(0, 1))
+        for now in range(1, horizon + 1):
+            begin = max(0, now - c["history"])
+            latents.append(model.predict(torch.stack(latents[begin:], 1), actions[:, begin:now])[:, -1])
+    near(rolled["predicted_emb"].flatten(0, 1), torch.stack(latents, 1))
+    goal = rolled["goal_emb"].reshape(costs.shape[0], -1, latents[-1].shape[-1])[:, -1:]
+    near(costs, (latents[-1].unflatten(0, costs.shape) - goal).square().sum(-1))
+    assert (rolled["predicted_emb"] - unchanged["predicted_emb"]).abs().max() > 0.01
+
+
+def test_a_replaced_forward_pass_of_a_class_is_called_in_rollouts(monkeypatch):
+    c, parts = recorded(GOLDEN / "lewm-small.safetensors")
+    model = load(jepa(swm.wm.LeWM, c, c["dim"]), parts["w"])
+    assert rolls(model.predictor)
+    calls, forward = [], Attention.forward
+
+    @functools.wraps(forward)
+    def watched(self, x, causal=True):
+        calls.append(x.shape)
+        return forward(self, x, causal)
+
+    monkeypatch.setattr(Attention, "forward", watched)
+    candidates = parts["i"]["candidates"]
+    spread = parts["i"]["pixels"][:1, None, :1].expand(-1, candidates.shape[1], *([-1] * 4))
+    with torch.no_grad():
+        model.rollout({"pixels": spread}, candidates[:1])
+    assert len(calls) == candidates.shape[2] * c["depth"]
+    # Dropout as an estimate of the uncertainty: of a part that trains on its own.
+    model.predictor.dropout.train()
+    assert not rolls(model.predictor)
+
+
+def test_every_module_can_be_the_first_that_is_imported():
+    program = """
+import sys
+import stable_worldmodel as swm
+import torch
+for name in [*swm.wm.__all__, *swm.wm._MODULES]:
+    for loaded in [key for key in sys.modules if key.startswith("stable_worldmodel.wm")]:
+        del sys.modules[loaded]
+    vars(swm).pop("wm", None)
+    getattr(swm.wm, name)
+"""
+    done = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.skipif(not (MORE / "pldm-losses-0.safetensors").exists(), reason="no recordings of other sizes")

@@ -18,6 +18,8 @@ torch = pytest.importorskip("torch")
 torch.set_num_threads(1)
 
 from stable_worldmodel.train import Options, Trainer, parsed, train  # noqa: E402
+from stable_worldmodel.train.losses import losses_of  # noqa: E402
+from stable_worldmodel.train.ranks import Ranks  # noqa: E402
 from stable_worldmodel.wm._weights import read_safetensors  # noqa: E402
 from stable_worldmodel.wm.utils import load_pretrained  # noqa: E402
 
@@ -246,18 +248,63 @@ def test_the_engine_plans_with_what_torch_trained(family, rooms, swings, tmp_pat
         assert 0 <= world.evaluate(episodes=2, seed=0)["success_rate"] <= 100
 
 
-@pytest.mark.parametrize(("kind", "method"), [("LeWM", "_features"), ("PreJEPA", "predict"), ("TDMPC2", "encode")])
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    [
+        *(("LeWM", method) for method in ("_features", "encode", "predict")),
+        *(("PreJEPA", method) for method in ("encode", "predict", "decode")),
+        *(("TDMPC2", method) for method in ("encode", "forward")),
+    ],
+)
 def test_a_class_of_the_user_is_trained(kind, method, rooms, swings, tmp_path):
     family, data = {"LeWM": ("lewm", rooms), "PreJEPA": ("dino_wm", rooms), "TDMPC2": ("tdmpc2", swings)}[kind]
     base, calls = getattr(swm.wm, kind), []
 
     def halved(self, *arguments):
         calls.append(arguments)
-        return getattr(base, method)(self, *arguments) / 2
+        found = getattr(base, method)(self, *arguments)
+        if isinstance(found, dict):
+            name = "reconstructed_pixels" if method == "decode" else "emb"
+            return {**found, name: found[name] / 2}
+        return tuple(part / 2 for part in found) if isinstance(found, tuple) else found / 2
 
-    torch_train(family, data, tmp_path / "run", SHORT, kind=type("Halved", (base,), {method: halved}))
-    # TD-MPC2 encodes the first frames and those after them.
-    assert len(calls) == (12 if kind == "TDMPC2" else 6)
+    settings = [*SHORT, "model.decoder=8"] if method == "decode" else SHORT
+    for name, chosen in (("run", type("Halved", (base,), {method: halved})), ("plain", None)):
+        torch_train(family, data, tmp_path / name, settings, kind=chosen)
+    # TD-MPC2 encodes the first frames and those after them, and predicts each step.
+    assert len(calls) % 6 == 0 and calls
+    found, plain = weights(tmp_path / "run"), weights(tmp_path / "plain")
+    assert any(not torch.equal(found[key], plain[key]) for key in plain)
+
+
+def test_a_class_that_changes_nothing_trains_the_same_weights(rooms, tmp_path):
+    class Same(swm.wm.LeWM):
+        def encode(self, info):
+            return super().encode(info)
+
+        def predict(self, emb, act_emb):
+            return super().predict(emb, act_emb)
+
+    for name, kind in (("same", Same), ("plain", None)):
+        torch_train("lewm", rooms, tmp_path / name, SHORT, kind=kind)
+    found, plain = weights(tmp_path / "same"), weights(tmp_path / "plain")
+    # The actions of overlapping windows are encoded once.
+    assert distance(found, plain) < 1e-3
+
+
+@pytest.mark.parametrize("method", ["encode", "predict_actions", "predict_values"])
+def test_a_class_whose_methods_training_does_not_call_is_refused(method, rooms, tmp_path):
+    kind = type("Mine", (swm.wm.GCRL,), {method: lambda self, *arguments: None})
+    with pytest.raises(TypeError, match=f"Mine.{method}: .*would not call"):
+        torch_train("gcbc", rooms, tmp_path / "run", SHORT, kind=kind)
+    assert not (tmp_path / "run").exists()
+
+
+def test_several_processes_refuse_a_class_that_encodes_otherwise():
+    kind = type("Mine", (swm.wm.LeWM,), {"encode": lambda self, info: info})
+    losses_of("lewm").check_kind(kind, Ranks())
+    with pytest.raises(TypeError, match=r"Mine.encode: 2 processes .*one process"):
+        losses_of("lewm").check_kind(kind, Ranks(0, 2))
 
 
 #: Computes the gradients of batches, whose slices the processes have, and saves the sums.

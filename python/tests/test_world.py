@@ -1,5 +1,6 @@
 """Tests of `World`: interactive loops, collection and evaluation."""
 
+import gc
 import json
 import os
 import resource
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -94,6 +96,16 @@ def test_factors_are_sampled_and_pinned():
     assert len(set(colours)) > 1
     # Fractions of 1 are scaled to 0..255.
     assert world.factors(0)["background.color"] == [26.0, 51.0, 230.0]
+    # Floats from 0 to 1 are fractions, integers are values of 255.
+    for given, stored in (
+        ([1.0, 0.0, 0.0], [255, 0, 0]),
+        (np.float32([1, 1, 0]), [255, 255, 0]),
+        ([1, 0, 0], [1, 0, 0]),
+        (np.uint8([1, 1, 0]), [1, 1, 0]),
+        ([2.0, 1.0, 0.0], [2, 1, 0]),
+    ):
+        world.reset(seed=0, options={"variation_values": {"background.color": given}})
+        assert world.factors(0)["background.color"] == stored
     with pytest.raises(ValueError, match="agent.color"):
         world.reset(options={"variation": ["agent.colour"]})
     with pytest.raises(ValueError, match="variations"):
@@ -276,6 +288,15 @@ def test_metrics_name_the_episodes_that_count():
     metrics = swm.world.Metrics(success_rate=50.0, interval=(9.5, 90.5), seeds=np.arange(3))
     metrics.results = {"runs": [{"success": {"n": 2}}]}  # The third episode was solved at its start.
     assert str(metrics) == "50.0 % [10, 90] of 2 episodes"
+
+
+def test_an_evaluation_of_no_episode_has_no_rate(tmp_path):
+    world = rooms(num_envs=1, max_episode_steps=8)
+    world.collect(tmp_path / "d.lance", policy=Zero(), episodes=2, seed=0, progress=False)
+    metrics = world.evaluate(dataset=tmp_path / "d.lance", episodes=2, goal_offset=1, eval_budget=3, seed=0, progress=False)
+    assert metrics["solved_at_start"] == 2 and metrics["interval"] == (0, 100)
+    assert np.isnan([metrics["success_rate"], metrics["random_success_rate"]]).all()
+    assert str(metrics) == "no episode counts: 2 of 2 starts satisfy the goal already"
 
 
 def test_evaluation_starts_at_rows_of_a_dataset(tmp_path):
@@ -611,3 +632,89 @@ def test_a_world_closes_all_environments_though_one_raises():
         world.close()
     world.close()
     assert len(closed) == 3
+
+
+def test_a_world_keeps_no_policy_that_nobody_else_keeps():
+    world = rooms(num_envs=1, add_pixels=False)
+    world.reset(seed=0)
+    gone = []
+    for seed in range(4):
+        policy = swm.policy.RandomPolicy(seed=seed)
+        gone.append(weakref.ref(policy))
+        world.set_policy(policy)
+        world.step()
+    del policy
+    gc.collect()
+    assert [one() is None for one in gone] == [True, True, True, False] and len(world._actors) == 1
+
+
+def test_the_seed_of_a_policy_is_recorded_and_continued(tmp_path):
+    world = rooms(num_envs=1, add_pixels=False, max_episode_steps=5)
+    path = tmp_path / "d.lance"
+    world.collect(path, policy=swm.policy.RandomPolicy(seed=2), episodes=2, seed=5, progress=False)
+    assert swm.data.load_dataset(path).manifest["config"]["policy"] == "random,seed=2"
+    more = {"episodes": 3, "seed": 5, "progress": False, "mode": "resume"}
+    for other in (3, None):
+        with pytest.raises(ValueError, match='its episodes were collected with policy "random,seed=2"'):
+            world.collect(path, policy=swm.policy.RandomPolicy(seed=other), **more)
+    assert world.collect(path, policy=swm.policy.RandomPolicy(seed=2), **more)["added"] == 1
+    world.collect(tmp_path / "e.lance", policy=swm.policy.ExpertPolicy(), episodes=1, progress=False)
+    assert swm.data.load_dataset(tmp_path / "e.lance").manifest["config"]["policy"] == "expert"
+
+
+class Signed(gym.Env):
+    """Has an action space that contains -1, and a frame of random pixels."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    metadata = {"render_modes": ["rgb_array"]}
+    frame = np.random.default_rng(0).integers(0, 255, (50, 70, 3), dtype=np.uint8)
+
+    def __init__(self, start=-1, render_mode="rgb_array"):
+        self.action_space, self.render_mode = gym.spaces.Discrete(3, start=start), render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), float(action), False, False, {}
+
+    def render(self):
+        return self.frame
+
+
+@pytest.fixture
+def signed():
+    name = "Signed-v0"
+    gym.register(name, Signed)
+    yield name
+    del gym.registry[name]
+
+
+def test_minus_one_is_no_action_of_a_dataset(signed, tmp_path):
+    given = {"policy": swm.policy.RandomPolicy(), "episodes": 4, "seed": 0, "progress": False}
+    with swm.World(signed, add_pixels=False, max_episode_steps=4) as world:
+        with pytest.raises(ValueError, match="contains -1, which marks a missing action.*start at 0"):
+            world.collect(tmp_path / "d.lance", **given)
+        # It acts nevertheless.
+        world.set_policy(given["policy"])
+        world.reset(seed=0)
+        world.step(3)
+        assert world.rewards[0] in (-1, 0, 1)
+    with swm.World(signed, add_pixels=False, max_episode_steps=4, start=-4) as world:
+        assert world.collect(tmp_path / "d.lance", **given)["added"] == 4
+
+
+def test_frames_are_resized_as_given(signed):
+    frames = []
+    for resample in (None, "bilinear", "nearest", 0):
+        with swm.World(signed, image_shape=(10, 14), image_resample=resample) as world:
+            world.reset(seed=0)
+            frames.append(world.infos["pixels"][0, 0].copy())
+    assert np.array_equal(frames[0], frames[1]) and np.array_equal(frames[2], Signed.frame[2::5, 2::5])
+    assert np.array_equal(frames[2], frames[3]) and not np.array_equal(frames[1], frames[2])
+    for resample in ("junk", 3, "bicubic"):
+        with pytest.raises(ValueError, match="image_resample: .*expected 'bilinear' or 'nearest'"):
+            swm.World(signed, image_resample=resample)
+    with pytest.raises(ValueError, match="swm_pixel_art"):
+        swm.World(signed, image_resample="nearest", workers=True)

@@ -1,10 +1,15 @@
-"""Native environments in a Gymnasium wrapper of the user, which changes nothing."""
+"""Native environments in Gymnasium wrappers of the user."""
+
+import pickle
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import RescaleAction, TransformObservation
 
 import stable_worldmodel as swm
+from stable_worldmodel.wrapper.visual import GrayscaleWrapper, NoiseWrapper
 
 
 class Same(gymnasium.Wrapper):
@@ -71,3 +76,136 @@ def test_the_simulator_refuses_environments_in_wrappers(world):
     world.reset(seed=0)
     with pytest.raises(ValueError, match="without wrappers written in Python"):
         world.step()
+
+
+class Discretized(gymnasium.ActionWrapper):
+    """Has discrete actions."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gymnasium.spaces.Discrete(3)
+
+    def action(self, action):
+        return np.array([action - 1, 0], np.float32)
+
+
+class Halves(gymnasium.ActionWrapper):
+    """Rounds actions of a `MultiDiscrete` space with as many values."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gymnasium.spaces.MultiDiscrete([3, 3])
+
+    def action(self, action):
+        return np.asarray(action, np.float32) - 1
+
+
+@pytest.mark.parametrize("wrap", [Discretized, Halves, lambda env: RescaleAction(env, -4.0, 4.0)])
+@pytest.mark.parametrize("policy", [swm.policy.ExpertPolicy(), swm.policy.MixturePolicy({"random": 1, "expert": 1})])
+def test_experts_refuse_other_actions(wrap, policy):
+    with swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False, max_episode_steps=4, extra_wrappers=[wrap]) as world:
+        words = "change the action space from Box.*write a policy that converts"
+        with pytest.raises(ValueError, match=words):
+            world.evaluate(policy=policy, episodes=2, seed=0, progress=False)
+        with pytest.raises(ValueError, match=words):
+            world.collect(writer=swm.data.ReplayBuffer(100), episodes=2, seed=0, progress=False)
+        world.reset(seed=0)
+        with pytest.raises(ValueError, match=words):
+            world.step()
+        for other in (swm.policy.RandomPolicy(), swm.policy.MixturePolicy({"random": 1})):
+            world.collect(writer=swm.data.ReplayBuffer(100), policy=other, episodes=2, seed=0, progress=False)
+
+
+def smaller(env):
+    """Divides the observation by 100."""
+    nested = isinstance(env.observation_space, gymnasium.spaces.Dict)
+    change = (lambda seen: {key: value / 100 for key, value in seen.items()}) if nested else lambda seen: seen / 100
+    return TransformObservation(env, change, env.observation_space)
+
+
+def renamed(env):
+    """Renames the state."""
+    return swm.wrapper.MapKeysWrapper(env, {"goal_state": "target"})
+
+
+@pytest.mark.parametrize(
+    ("name", "wrap", "columns"),
+    [
+        ("swm/PushT-v1", smaller, "'state', 'proprio'"),
+        ("swm/FetchReachDict-v3", smaller, "'achieved_goal', 'desired_goal', 'observation'"),
+        ("swm/TwoRoom-v1", renamed, "'goal_state'"),
+    ],
+)
+def test_experts_refuse_other_columns(name, wrap, columns):
+    with swm.World(name, num_envs=2, add_pixels=False, max_episode_steps=4, extra_wrappers=[wrap]) as world:
+        with pytest.raises(ValueError, match=rf"change or remove the columns \[{columns}\]"):
+            world.evaluate(policy=swm.policy.ExpertPolicy(), episodes=2, seed=0, progress=False)
+
+
+class Rounded(gymnasium.ActionWrapper):
+    """Has the same action space, of 64-bit values."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        low, high = env.action_space.low, env.action_space.high
+        self.action_space = gymnasium.spaces.Box(low.astype(np.float64), high.astype(np.float64), dtype=np.float64)
+
+    def action(self, action):
+        return action.astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "name", ["swm/PushT-v1", "swm/TwoRoom-v1", "swm/FetchReach-v3", "swm/ReacherDMControl-v0", "swm/CartPoleControl-v1"]
+)
+@pytest.mark.parametrize("steps", [0, 3])
+def test_experts_play_in_wrappers_that_change_neither(name, steps):
+    wrappers = [Same] if "CartPole" in name else [Same, Rounded]
+    played = []
+    for wrapped in ([], wrappers):
+        with swm.World(name, num_envs=2, add_pixels=False, max_episode_steps=9, extra_wrappers=wrapped) as world:
+            world.set_policy(swm.policy.RandomPolicy())
+            world.reset(seed=[3, 4])
+            world.step(steps)
+            world.set_policy(swm.policy.ExpertPolicy())
+            world.step(2)
+            played.append(world.infos["action"].copy())
+            world.evaluate(episodes=2, seed=1, progress=False, floor=False)
+    assert np.array_equal(*played)
+
+
+def test_experts_of_ogbench_play_in_wrappers():
+    written = []
+    for wrapped in ([], [Same]):
+        with swm.World("swm/OGBMaze-v0", add_pixels=False, extra_wrappers=wrapped) as world:
+            world.set_policy(swm.policy.ExpertPolicy())
+            world.reset(seed=[7])
+            world.step(5)
+            written.append([world.infos[key].copy() for key in ("action", "goal/next_xy")])
+            world.evaluate(episodes=1, seed=0, progress=False, floor=False)
+    for one, other in zip(*written, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_the_frame_of_the_goal_is_changed_or_the_reason_given():
+    with swm.World("swm/TwoRoom-v1", image_shape=(32, 32), extra_wrappers=[GrayscaleWrapper], wrap_goal=True) as world:
+        world.reset(seed=0)
+        assert np.ptp(world.infos["goal"], axis=-1).max() == 0
+    with pytest.raises(ValueError, match="wrap_goal: visual wrappers.*leave those out"):
+        swm.World("swm/TwoRoom-v1", image_shape=(32, 32), extra_wrappers=[Same, GrayscaleWrapper], wrap_goal=True)
+    swm.World("swm/TwoRoom-v1", image_shape=(32, 32), extra_wrappers=[Same], wrap_goal=True).close()
+
+
+def test_stacked_wrappers_draw_as_in_the_engine():
+    noise = partial(NoiseWrapper, std=10.0)
+    frames = []
+    for wrappers in ([noise, noise], [Same, noise, Same, noise], [noise], []):
+        with swm.World("swm/TwoRoom-v1", image_shape=(32, 32), extra_wrappers=wrappers) as world:
+            world.reset(seed=[7], options={"variation_values": {"background.color": [128, 128, 128]}})
+            frames.append(world.infos["pixels"][0, 0].astype(float))
+    assert np.array_equal(frames[0], frames[1])
+    plain = frames.pop()
+    two, one = ((frame - plain)[plain == 128].std() for frame in frames[1:])
+    assert 1.3 < two / one < 1.5
+    env = NoiseWrapper(NoiseWrapper(gymnasium.make("swm/TwoRoom-v1", image_shape=(32, 32)), std=10.0), std=10.0)
+    env.reset(seed=7)
+    assert np.array_equal(pickle.loads(pickle.dumps(env)).render(), env.render())

@@ -101,6 +101,57 @@ def test_env_pool_steps_chosen_environments():
         pool.reset(seed=[1])
 
 
+class Acting(gymnasium.Env):
+    """Keeps the actions of an action space."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, action_space):
+        self.action_space, self.taken = action_space, []
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.taken.append(action)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+PARTS = (gymnasium.spaces.Discrete(3), gymnasium.spaces.Box(0, 1, (2,), np.float32), gymnasium.spaces.Text(4))
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gymnasium.spaces.Tuple((gymnasium.spaces.Discrete(3), gymnasium.spaces.Discrete(100, start=5))),
+        gymnasium.spaces.Tuple(PARTS),
+        gymnasium.spaces.Dict(dict(zip("abc", PARTS, strict=True))),
+        gymnasium.spaces.Tuple((gymnasium.spaces.Dict(a=PARTS[0]), gymnasium.spaces.Tuple(PARTS[:2]))),
+    ],
+)
+@pytest.mark.parametrize("envs", [2, 3])
+def test_pools_step_with_samples_of_their_action_space(space, envs):
+    pool = EnvPool([lambda: Acting(space)] * envs)
+    pool.reset(seed=0)
+    pool.action_space.seed(3)
+    sampled = pool.action_space.sample()
+    pool.step(sampled)
+    taken = [env.taken[0] for env in pool.envs]
+    # One action for each environment, in a list or a tuple.
+    pool.step(taken)
+    pool.step(tuple(taken))
+    for env, first in zip(pool.envs, taken, strict=True):
+        for other in env.taken[1:]:
+            assert repr(other) == repr(first)
+    first = sampled["a"] if isinstance(space, gymnasium.spaces.Dict) else sampled[0]
+    first = first["a"] if isinstance(first, dict) else first
+    firsts = [action["a"] if isinstance(action, dict) else action[0] for action in taken]
+    assert [value["a"] if isinstance(value, dict) else value for value in firsts] == first.tolist()
+    with pytest.raises(ValueError, match=f"expected {envs} actions, one for each environment"):
+        pool.step(taken[:1])
+
+
 class Changing(gymnasium.Env):
     """Returns infos of other types and shapes than at its reset, one at a time."""
 
@@ -245,6 +296,15 @@ def test_experts_of_the_modules_play_as_the_engine_experts(tmp_path):
     assert np.array_equal(weak, states(swm.policy.ExpertPolicy("weak", seed=1), "swm/PushT-v1"), equal_nan=True)
     with pytest.raises(ValueError, match="door_fit_margin"):
         ExpertPolicy(door_fit_margin=2.0)
+
+
+@pytest.mark.parametrize(("rings", "sectors"), [(2, 16), (16, 16), (4, 36)])
+def test_cells_of_the_polar_quantizer_are_found_again(rings, sectors):
+    from stable_worldmodel.envs.quantizer import PolarQuantizer
+
+    grid = PolarQuantizer(rings, sectors, 1.0)
+    for cell in np.ndindex(rings, sectors):
+        assert tuple(grid.quantize(grid.dequantize(cell))) == cell
 
 
 def test_polar_quantizer():

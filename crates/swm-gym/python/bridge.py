@@ -418,7 +418,9 @@ class Bridge:
         return offset
 
     def column(self, names, name, prefix, dtype, shape):
-        name = name.replace('/', '_').replace(' ', '_')
+        # Experts of a native environment read its columns by their own names.
+        if not getattr(self.env.unwrapped, 'swm_keeps_names', False):
+            name = name.replace('/', '_').replace(' ', '_')
         while name in RESERVED or name in names:
             name = prefix + name
         names.add(name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -18,6 +19,9 @@ from .dataset import Dataset, Rows, Transform
 from .format import open_writer
 
 __all__ = ["ReplayBuffer", "classic_filter"]
+
+#: The samplers that a buffer keeps: those of a training and of its evaluations.
+_MOST_SAMPLERS = 4
 
 #: `(step, buffer, batch_size, history_len) -> indices of clips`.
 Sampler = Callable[[int, "ReplayBuffer", int, int], Any]
@@ -148,20 +152,20 @@ class ReplayBuffer(Dataset):
         self._columns: list[tuple[str, str, list[int]]] = []
         #: Held while the content changes, and while a sampler of the user, which may call the buffer, chooses from it.
         self._lock = threading.RLock()
-        #: The samplers of the engine's buffer, by batch size and history length.
-        self._samplers: dict[tuple[int, int], Any] = {}
+        #: The latest samplers of the engine's buffer, by batch size and history length. Each keeps memory for its batches.
+        self._samplers: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._step = 0
         self._refresh()
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with the episodes in place of the engine's memory. A copy counts its own `num_episodes_added`."""
-        gone: dict[str, Any] = {"_buffer": None, "_content": None, "_samplers": {}, "_lock": None}
+        gone: dict[str, Any] = {"_buffer": None, "_content": None, "_samplers": None, "_lock": None}
         return {**self.__dict__, **gone, "_episodes": list(self.episodes())}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         episodes = state.pop("_episodes")
         self.__dict__.update(state)
-        self._lock = threading.RLock()
+        self._lock, self._samplers = threading.RLock(), OrderedDict()
         self._refresh()
         filter, self.key_filter = self.key_filter, None
         self.write_episodes(episodes)
@@ -223,6 +227,21 @@ class ReplayBuffer(Dataset):
         content = self._content
         content.transform = self.transform
         return content
+
+    def _at_this_moment(self, last: Any) -> Dataset:
+        """What reads the current content, also after another episode; `last`, which this returned before, if it still does.
+
+        That of a subclass is of the subclass, whose methods read as those of the buffer do.
+        """
+        if type(self) is ReplayBuffer:
+            return self._now
+        with self._lock:
+            attributes = self.__dict__
+            if type(last) is not type(self) or last._content is not self._content:
+                last = object.__new__(type(self))
+            # The user may have set attributes since.
+            last.__dict__.update(attributes)
+        return last  # type: ignore[no-any-return]
 
     @property
     def column_names(self) -> list[str]:
@@ -291,6 +310,9 @@ class ReplayBuffer(Dataset):
                 "recent": None,
             }
             self._samplers[key] = self._buffer.sampler(json.dumps(settings), self.seed)
+            while len(self._samplers) > _MOST_SAMPLERS:
+                self._samplers.popitem(last=False)
+        self._samplers.move_to_end(key)
         return self._samplers[key]
 
     @property

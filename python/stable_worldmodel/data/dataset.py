@@ -373,7 +373,7 @@ class StoredDataset(Dataset):
     def get_col_data(self, col: str) -> Array:
         self._check(col)
         if col in self._merged:
-            return self._merged[col]
+            return self._merged[col].copy()
         all_episodes = np.arange(self.num_episodes)
         return self._read([col], all_episodes, np.zeros_like(all_episodes), self.lengths, 1)[col]
 
@@ -741,7 +741,7 @@ def _items(dataset: Any, indices: Sequence[int]) -> list[dict[str, Any]]:
 def at_this_moment(dataset: Any, last: Any) -> Any:
     """The dataset with the present content of its replay buffers; `last`, which this returned before, if none has changed."""
     if not isinstance(dataset, (MergeDataset, ConcatDataset)):
-        return dataset._now if hasattr(type(dataset), "_now") else dataset
+        return dataset._at_this_moment(last) if hasattr(type(dataset), "_at_this_moment") else dataset
     before = last.datasets if type(last) is type(dataset) else [None] * len(dataset.datasets)
     parts = [at_this_moment(part, known) for part, known in zip(dataset.datasets, before, strict=True)]
     for known in (dataset, last):

@@ -11,11 +11,14 @@ from contextvars import ContextVar
 from typing import Any
 
 from stable_worldmodel import _engine
+from stable_worldmodel._overrides import is_overridden
 
 from . import _tensors
 from ._tensors import Array
+from .buffer import ReplayBuffer
+from .dataset import ConcatDataset, MergeDataset, StoredDataset
 
-__all__ = ["engine_of", "left_out"]
+__all__ = ["check_overrides", "engine_of", "left_out"]
 
 #: The number of cached slices: a conversion reads the columns of an episode one after another.
 _CACHED = 4
@@ -97,3 +100,25 @@ def engine_of(dataset: Any) -> Any:
     if not hasattr(dataset, "lengths") or not (hasattr(dataset, "_load_slice") or hasattr(dataset, "load_episode")):
         raise TypeError(f"expected a dataset, with `lengths` and `load_episode` or `_load_slice`, got {type(dataset).__name__}")
     return _engine.Dataset.foreign(_Rows(dataset))
+
+
+def check_overrides(caller: str, dataset: Any, instead: str) -> None:
+    """Checks that the engine reads what a dataset's class returns.
+
+    Args:
+        caller: The function or class that reads the dataset in the engine.
+        dataset: The dataset; datasets that it joins are checked, too.
+        instead: What the user can do instead.
+
+    Raises:
+        TypeError: If a user's subclass of a dataset that the engine reads overrides how it is read.
+    """
+    if isinstance(dataset, (StoredDataset, ReplayBuffer, ConcatDataset, MergeDataset)):
+        for method in ("__getitem__", "__getitems__", "load_chunk", "load_episode", "_load_slice"):
+            if hasattr(dataset, method) and is_overridden(dataset, method):
+                raise TypeError(
+                    f"{caller}: the engine reads stored rows and would not call {type(dataset).__name__}.{method}; {instead}"
+                )
+    if isinstance(dataset, (ConcatDataset, MergeDataset)):
+        for part in dataset.datasets:
+            check_overrides(caller, part, instead)

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from stable_worldmodel import _engine, _options
-from stable_worldmodel._overrides import is_overridden
 
 from . import _tensors
 from ._tensors import NUMBERING, Array
@@ -29,7 +28,7 @@ from .dataset import (
     transformed,
     transforms_of,
 )
-from .foreign import engine_of
+from .foreign import check_overrides, engine_of
 from .utils import load_dataset
 
 __all__ = ["Goals", "Loader"]
@@ -171,7 +170,7 @@ class Loader:
         self.transform = transform
         #: The dataset, or the content of its replay buffers, that the engine reads.
         self._content = at_this_moment(dataset, None)
-        _check_overrides(self._content)
+        check_overrides("Loader", dataset, "use torch's DataLoader, or the dataset's transform")
         #: Whether the dataset, or one that it joins, has a transform of samples.
         self._has_own = bool(transforms_of(self._content))
         self.batch_size = _options.whole("batch_size", batch_size)
@@ -378,22 +377,6 @@ class Loader:
     def __repr__(self) -> str:
         clips = f"{self.num_clips} clips of {self.num_steps} steps, frameskip {self.frameskip}"
         return f"Loader({len(self)} batches of {self.batch_size}: {clips})"
-
-
-def _check_overrides(dataset: Any) -> None:
-    """Checks that the engine reads what a dataset's class returns.
-
-    Raises:
-        TypeError: If a user's subclass of a stored dataset overrides how it is read.
-    """
-    for inner in (dataset, *getattr(dataset, "datasets", ())):
-        if isinstance(inner, (StoredDataset, ConcatDataset, MergeDataset)):
-            for method in ("__getitem__", "__getitems__", "load_chunk", "load_episode"):
-                if hasattr(inner, method) and is_overridden(type(inner), method):
-                    raise TypeError(
-                        f"Loader: the engine reads stored rows and would not call {type(inner).__name__}.{method}; use torch's "
-                        "DataLoader, or load_dataset with a transform"
-                    )
 
 
 def _without_samples(value: Any) -> Any:

@@ -16,7 +16,7 @@ from stable_worldmodel import _engine
 
 from . import _tensors
 from .dataset import Transform
-from .foreign import engine_of, left_out
+from .foreign import check_overrides, engine_of, left_out
 from .format import FORMATS, detect_format, get_format, validate_write_mode
 from .normalization import column_normalizer
 from .writer import codec_json
@@ -228,9 +228,13 @@ def convert(
         A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (the number of actions left
         out, because no observation follows them), `checksum`, and the comparison of the `columns`. For a user-defined
         format, `episodes` and `rows`.
+
+    Raises:
+        TypeError: If a subclass of an open dataset that the engine reads overrides how it is read, such as `load_episode`.
     """
     if isinstance(source, (str, os.PathLike)):
         source = load_dataset(source, cache_dir, source_format)
+    check_overrides("convert", source, "write the episodes that it returns with open_writer")
     format = dest_format if format is None else format
     kind = get_format(format) if format is not None else detect_format(dest)
     kind = FORMATS["lance"] if kind is None else kind

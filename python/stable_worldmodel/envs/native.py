@@ -34,6 +34,8 @@ class NativeEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
+    #: Tells the bridge that the engine chose the names of the columns, which it keeps, such as `goal/xy`.
+    swm_keeps_names = True
 
     def __init__(
         self, name: str, render_mode: str | None = "rgb_array", image_shape: tuple[int, int] = (224, 224), **options: Any

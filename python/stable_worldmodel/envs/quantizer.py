@@ -49,7 +49,8 @@ class PolarQuantizer:
         x, y = (float(value) for value in action)
         radius = np.hypot(x, y) / self.max_action_distance * self.num_bins_radial
         angle = np.arctan2(y, x) % (2 * np.pi) / (2 * np.pi) * self.num_bins_angular
-        cells = [min(int(radius), self.num_bins_radial - 1), min(int(angle), self.num_bins_angular - 1)]
+        # A rounded action at the first angle of a sector is in it.
+        cells = [min(int(radius), self.num_bins_radial - 1), int(angle + 1e-5) % self.num_bins_angular]
         return np.array(cells, np.int32)
 
     def dequantize(self, quantized_action: Any) -> np.ndarray:

@@ -25,7 +25,8 @@ def train(family: str, data: Any, kind: Any = None, *, settings: Any = (), **opt
     Args:
         family: The model: `lewm`, `pldm`, `dino_wm`, `tdmpc2`, `gcbc`, `gcivl` or `gciql`.
         data: The dataset: a path or a name.
-        kind: A class derived from that of the family, for models with other methods.
+        kind: A class derived from that of the family, for models with other methods. Training calls them; a class with a
+            method that it could not call is refused.
         settings: Settings of the configuration, such as `["model.latent=4"]`.
         **options: The other attributes of `Options`; names with `__` are settings, such as `schedule__steps=1000`.
     """

@@ -40,6 +40,7 @@ class Trainer:
 
     Raises:
         FileNotFoundError: If the dataset does not exist.
+        TypeError: If the class is not derived from that of the family, or overrides a method that training does not call.
         ValueError: If a setting is invalid, or the folder of the checkpoint holds a run that cannot be continued.
     """
 
@@ -50,6 +51,7 @@ class Trainer:
         self.device = _device(options.device)
         _check_compile(options.compile, self.device)
         self.ranks = Ranks.join(self.device)
+        losses.check_kind(kind, self.ranks)
         if self.device.type == "cuda" and self.device.index is None and self.ranks.size > 1:
             self.device = torch.device("cuda", self.ranks.rank % torch.cuda.device_count())
         dataset = load_dataset(options.data)

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from .._overrides import is_overridden
 from ..planning.evaluator import ShootingCostEvaluator, default_goal_encode
 from ..planning.objective import GoalMSE
 from .frames import Frames
-from .lewm.rollout import roll, rolls
 from .pretrained import Pretrained
 
 __all__ = ["JEPA"]
@@ -106,8 +106,12 @@ class JEPA(Pretrained):
 
     def _predicted(self, observed: Tensor, actions: Tensor, history: int) -> Tensor:
         """The latents of the observed frames, then the predictions, for encoded actions `(N, T, D)`."""
+        # The package `lewm` imports this module.
+        from .lewm.rollout import roll, rolls
+
         predictor: Any = self.predictor
-        if history <= getattr(predictor, "num_frames", 0) and rolls(predictor):
+        is_own = not is_overridden(self, "predict") and not self.pred_proj.training
+        if is_own and history <= getattr(predictor, "num_frames", 0) and rolls(predictor):
             rolled: Tensor = (self._roll or roll)(predictor, observed, actions, self.pred_proj, history)
             return rolled
         latents = list(observed.unbind(1))
@@ -132,8 +136,11 @@ class JEPA(Pretrained):
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compiles the encoder and the predictions of plans with `torch.compile`, which takes the arguments.
 
-        Training compiles on its own (`compile=true` of `stable_worldmodel.train`).
+        Predictions of an overridden `predict` or of a changed predictor are not compiled. Training compiles on its own
+        (`compile=true` of `stable_worldmodel.train`).
         """
+        from .lewm.rollout import roll
+
         self.encoder.compile(*args, **kwargs)
         self._roll = torch.compile(roll, *args, **kwargs)
 

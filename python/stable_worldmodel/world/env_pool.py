@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import batch_space, iterate
 
 from .. import spaces as swm_spaces
 from .._lazy import lazy
@@ -42,6 +42,8 @@ class EnvPool:
             raise ValueError("EnvPool: no environments; expected functions that create them")
         #: The seeds of the last resets.
         self.seeds: np.ndarray = np.zeros(len(self.envs), np.int64)
+        #: The number of resets of every environment, by which policies find out that an episode began.
+        self._resets: np.ndarray = np.zeros(len(self.envs), np.int64)
         self._infos: dict[str, Any] | None = None
 
     @property
@@ -109,6 +111,7 @@ class EnvPool:
         started: dict[int, dict[str, Any]] = {}
         for env in self._chosen(mask):
             _, started[env] = self.envs[env].reset(seed=seeds[env], options=given[env])
+            self._resets[env] += 1
             if seeds[env] is not None:
                 self.seeds[env] = seeds[env]
         if len(started) == count:
@@ -126,7 +129,8 @@ class EnvPool:
         """Steps environments.
 
         Args:
-            actions: One action for each environment.
+            actions: One action for each environment, or an element of `action_space`: for a `Dict` or `Tuple` space, its arrays
+                have one row for each environment.
             mask: The environments to step. The other ones keep their infos, and have no reward and no end of an episode.
 
         Returns:
@@ -135,6 +139,13 @@ class EnvPool:
         rewards = np.zeros(self.num_envs, np.float32)
         terminateds, truncateds = np.zeros((2, self.num_envs), bool)
         self._known()
+        if _is_batch(self.single_action_space, actions, self.num_envs):
+            actions = list(iterate(self.action_space, actions))
+        elif isinstance(actions, Mapping) or len(actions) != self.num_envs:
+            raise ValueError(
+                f"actions: expected {self.num_envs} actions, one for each environment, or an element of {self.action_space}, "
+                f"got {actions!r}"
+            )
         for env in self._chosen(mask):
             _, rewards[env], terminated, truncated, info = self.envs[env].step(actions[env])
             terminateds[env], truncateds[env] = _flag("terminated", terminated), _flag("truncated", truncated)
@@ -174,6 +185,31 @@ class EnvPool:
                 column[env, 0] = torch.as_tensor(array, dtype=column.dtype, device=column.device)
             else:
                 column[env, 0] = array
+
+
+def _is_batch(space: spaces.Space[Any], actions: Any, count: int) -> bool:
+    """Whether actions of a `Dict` or `Tuple` space are an element of the batched space, which holds arrays of `count` rows."""
+    if isinstance(space, spaces.Dict):
+        return isinstance(actions, Mapping) and all(
+            key in actions and _is_rows(part, actions[key], count) for key, part in space.spaces.items()
+        )
+    if isinstance(space, spaces.Tuple):
+        return (
+            isinstance(actions, tuple)
+            and len(actions) == len(space.spaces)
+            and all(_is_rows(part, rows, count) for part, rows in zip(space.spaces, actions, strict=True))
+        )
+    return False
+
+
+def _is_rows(space: spaces.Space[Any], rows: Any, count: int) -> bool:
+    """Whether this is a part of an element of a batched space."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        return _is_batch(space, rows, count)
+    if space.shape is None:
+        # Gymnasium batches spaces without a shape, such as `Text`, as tuples.
+        return isinstance(rows, tuple) and len(rows) == count
+    return not isinstance(rows, (tuple, list)) and np.shape(rows) == (count, *space.shape)
 
 
 def _flag(name: str, value: Any) -> bool:

@@ -20,10 +20,10 @@ __all__ = ["Metrics"]
 class Metrics(dict[str, Any]):
     """The metrics of an evaluation.
 
-    Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`,
-    the success rate and interval of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each
-    episode; `solved_at_start`, the number of starts that satisfy the goal; `time_to_goal`, the steps of successful episodes;
-    `plan_seconds`, the planning times; `videos`.
+    Keys: `success_rate` in percent, NaN if no episode counts because all starts satisfy the goal; `interval`, its 95 % Wilson
+    interval; `random_success_rate` and `random_interval`, the success rate and interval of the random-policy floor;
+    `episode_successes`, `seeds` and `steps`, one entry for each episode; `solved_at_start`, the number of starts that satisfy
+    the goal; `time_to_goal`, the steps of successful episodes; `plan_seconds`, the planning times; `videos`.
     """
 
     results: dict[str, Any]
@@ -33,7 +33,7 @@ class Metrics(dict[str, Any]):
         run, *floors = runs
         played = run["episodes"]
         metrics = cls(
-            success_rate=_percent(run["success"]["rate"]),
+            success_rate=_rate(run["success"]),
             interval=tuple(_percent(run["success"][side]) for side in ("low", "high")),
             episode_successes=np.array([episode["success"] for episode in played], dtype=bool),
             seeds=np.array([episode["seed"] for episode in played], dtype=np.int64),
@@ -46,7 +46,7 @@ class Metrics(dict[str, Any]):
         )
         if floors:
             floor = floors[0]["success"]
-            metrics["random_success_rate"] = _percent(floor["rate"])
+            metrics["random_success_rate"] = _rate(floor)
             metrics["random_interval"] = tuple(_percent(floor[side]) for side in ("low", "high"))
         manifest = {
             "kind": "evaluate",
@@ -85,6 +85,8 @@ class Metrics(dict[str, Any]):
     def __str__(self) -> str:
         low, high = self["interval"]
         counted = self.results["runs"][-1]["success"]["n"]
+        if not counted:
+            return f"no episode counts: {self['solved_at_start']} of {len(self['seeds'])} starts satisfy the goal already"
         text = f"{self['success_rate']:.1f} % [{low:.0f}, {high:.0f}] of {counted} episodes"
         if "random_success_rate" in self:
             low, high = self["random_interval"]
@@ -99,6 +101,11 @@ def _is_results(path: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(found, dict) and {"manifest", "runs"} <= found.keys()
+
+
+def _rate(success: dict[str, Any]) -> float:
+    """The rate in percent. The engine states 0 where no episode counts."""
+    return _percent(success["rate"]) if success["n"] else math.nan
 
 
 def _percent(rate: float | None) -> float:

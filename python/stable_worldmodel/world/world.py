@@ -9,6 +9,7 @@ import os
 import secrets
 import sys
 import warnings
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from .. import _engine, _files, _options, _progress
+from .. import _engine, _files, _gym, _options, _progress
 from .. import spaces as swm_spaces
 from .._lazy import lazy
 from .._overrides import is_overridden
 from ..wrapper.visual import engine_wrappers
 from .env_pool import WorldEnvs
+from .experts import check_experts
 from .metrics import Metrics
 from .transforms import FrameTransforms
 
@@ -49,11 +51,12 @@ class World:
         goal_transform: The same for `goal`.
         add_pixels: Whether frames are rendered.
         views: Additional camera views: cameras, `depth`, `segmentation`, or `CAMERA:MODALITY`.
-        wrap_goal: Whether visual wrappers also change the frame of the goal.
+        wrap_goal: Whether visual wrappers also change the frame of the goal; only if no wrapper is written in Python.
         threads: The number of worker threads, which does not affect results; 0 uses one for each core.
         workers: Whether each third-party environment runs in a worker process instead of this interpreter. The processes
             step in parallel and are restarted after a crash. They must be able to import the environment.
-        image_resample: The interpolation that resizes third-party frames: `"bilinear"`, or `"nearest"` for pixel art.
+        image_resample: The interpolation that resizes third-party frames: `"bilinear"`, or `"nearest"` for pixel art. `None`
+            takes that of the environment, as worker processes always do.
         **kwargs: Options of the environment.
 
     Attributes:
@@ -98,6 +101,12 @@ class World:
         threads = _options.count("threads", threads, 0)
         if isinstance(views, str):
             raise TypeError(f"views: {views!r}; expected a list, such as [{views!r}]")
+        nearest = _gym.is_nearest(image_resample)
+        if nearest is not None and workers:
+            raise ValueError(
+                f"image_resample: {image_resample!r}; worker processes resize as the environment's attribute swm_pixel_art "
+                "says; set it, or use workers=False"
+            )
         kwargs.pop("render_mode", None)
         if not self._is_native(env_name):
             kwargs = {key: _literal(value) for key, value in kwargs.items()}
@@ -116,15 +125,13 @@ class World:
         if in_engine is None and workers:
             raise ValueError("workers: user-defined wrappers cannot run in worker processes; use workers=False")
         if not (self._native or (in_engine is not None and workers)):
-            from .._gym import open_world
-
             if views:
                 problem = "only native environments without wrappers written in Python have camera views"
                 raise ValueError(f"views: {list(views)!r}; {problem}: leave them out, or leave out the wrappers")
             name, *given = env_name.split(",")
             settings = {**dict(word.split("=", 1) for word in given), **kwargs}
-            self._world, self.gym_envs, self._wrapping = open_world(
-                name, settings, self.num_envs, wrappers, image, max_episode_steps, image_resample, threads, wrap_goal
+            self._world, self.gym_envs, self._wrapping = _gym.open_world(
+                name, settings, self.num_envs, wrappers, image, max_episode_steps, nearest, threads, wrap_goal
             )
         else:
             # Worker processes use this Python interpreter.
@@ -154,7 +161,8 @@ class World:
         self._steps_in_engine = True
         #: The seed of the episodes that `step` plays.
         self.seed: int | None = None
-        self._actors: dict[int, tuple[Any, Any]] = {}
+        #: References to policies, and their actors, by the id of the policy. An actor ends with its policy.
+        self._actors: dict[int, tuple[Callable[[], Any], Any]] = {}
         self._episodes = [0] * self.num_envs
         #: The engine's keys of these episodes.
         self._episode_keys = np.zeros(self.num_envs, np.uint64)
@@ -361,7 +369,7 @@ class World:
         actor = None
         if self._steps_in_engine:
             known = self._actors.get(id(policy))
-            actor = known[1] if known is not None and known[0] is policy else self._actor(policy)
+            actor = known[1] if known is not None and known[0]() is policy else self._actor(policy)
         if actor is not None and isinstance(self._reset_text, str):
             begun, self._next_episode = self._world.play(actor, steps, self.seed or 0, self._next_episode, self._reset_text)
             for slot, episode in begun:
@@ -445,7 +453,7 @@ class World:
         self._fresh[list(slots)] = True
         self._any_fresh = True
         # Those that act within a policy implemented in Python as well.
-        for _, actor in self._actors.values():
+        for _, actor in list(self._actors.values()):
             for slot in slots:
                 self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
 
@@ -502,12 +510,14 @@ class World:
     def _actor(self, policy: Any) -> Any:
         """The engine's actor of a policy; `None` for a policy implemented in Python."""
         known = self._actors.get(id(policy))
-        if known is not None and known[0] is policy:
+        if known is not None and known[0]() is policy:
             return known[1]
         make = getattr(policy, "_actor", None)
+        if make is not None and self._wrapped_in_python:
+            check_experts(self, policy)
         actor = make(self) if make is not None else None
         if actor is not None:
-            self._actors[id(policy)] = (policy, actor)
+            self._actors[id(policy)] = (_reference(policy, self._actors), actor)
             for slot in range(self.num_envs):
                 self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
         return actor
@@ -568,7 +578,8 @@ class World:
             progress: Whether to show progress.
             dataset_path: Another name for `path`.
             policy: The policy to set first; `None` keeps the policy of `set_policy`. A dict of weights by policy name, such as
-                `{"expert": 0.7, "random": 0.3}`, stands for `swm.policy.MixturePolicy`.
+                `{"expert": 0.7, "random": 0.3}`, stands for `swm.policy.MixturePolicy`. The manifest has the policy's name,
+                and its `seed` if it has one: `random,seed=3`.
             mode: The treatment of an existing dataset: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
                 more, `"resume"` continues until the dataset has `episodes`.
             codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
@@ -594,6 +605,7 @@ class World:
             from ..policy import MixturePolicy
 
             policy = MixturePolicy(policy)
+        _check_storable(self.single_action_space)
         policy = self._chosen(policy)
         if writer is None and format is None:
             format = _FORMAT_OF_SUFFIX.get(Path(str(path)).suffix)
@@ -607,7 +619,7 @@ class World:
             "episodes": episodes,
             "seed": _seed(seed),
             "variation": _options.variation(_without_states(options), self.spec["variation"]),
-            "policy": (None if is_overridden(policy, "get_action") else getattr(policy, "_choice", None)) or _name(policy),
+            "policy": (None if is_overridden(policy, "get_action") else getattr(policy, "_choice", None)) or _recorded(policy),
             "action_noise": action_noise or float(getattr(policy, "action_noise", 0.0)),
             "goal": bool(goal),
             "first": first,
@@ -828,6 +840,41 @@ def _name(policy: Any) -> str:
     )
     own = kind in (None, "", "base") or (inherits and is_overridden(policy, "get_action"))
     return type(policy).__name__ if own else str(kind)
+
+
+def _check_storable(space: spaces.Space[Any]) -> None:
+    """Checks that datasets can hold all actions of a space.
+
+    Raises:
+        ValueError: If -1 is an action: in columns of whole numbers it marks that there is none.
+    """
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        start = np.asarray(space.start)
+        count = np.asarray(space.n if isinstance(space, spaces.Discrete) else space.nvec)
+        if np.all((start <= -1) & (start + count > -1)):
+            raise ValueError(
+                f"World.collect: the action space {space} contains -1, which marks a missing action in datasets; wrap the "
+                "environment so that its actions start at 0"
+            )
+
+
+def _recorded(policy: Any) -> str:
+    """The name of a policy with its seed, which decides what is collected."""
+    seed = getattr(policy, "seed", None)
+    seeded = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
+    return f"{_name(policy)},seed={seed}" if seeded else _name(policy)
+
+
+def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any]]) -> Callable[[], Any]:
+    """A reference to a policy, at whose end its actor leaves `actors`: an actor may hold a model of gigabytes."""
+    key = id(policy)
+
+    def end(reference: weakref.ref[Any]) -> None:
+        # Another policy may have the same id since.
+        if key in actors and actors[key][0] is reference:
+            del actors[key]
+
+    return weakref.ref(policy, end)
 
 
 def _without_states(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:

@@ -102,11 +102,14 @@ class VisualWrapper(gymnasium.Wrapper):
     id: ClassVar[str]
     #: The names of the settings that can be positional arguments, in order.
     positional: ClassVar[tuple[str, ...]] = ()
+    #: The index in the stack: the number of visual wrappers inside this one.
+    _index = 0
 
     def __init__(self, env: gymnasium.Env, *values: Any, seed: int | None = None, **settings: Any) -> None:
         super().__init__(env)
         self._settings = self.engine_settings(*values, **settings)
-        self._engine_wrapper = _engine.VisualWrappers(json.dumps([[self.id, self._settings]]))
+        self._index = _count(env)
+        self._engine_wrapper = self._made()
         self._seed, self._episode, self._step = seed or 0, 0, 0
         self._episode_seed = self._seed
         self._engine_wrapper.reset(self._seed)
@@ -116,8 +119,13 @@ class VisualWrapper(gymnasium.Wrapper):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._engine_wrapper = _engine.VisualWrappers(json.dumps([[self.id, self._settings]]))
+        self._engine_wrapper = self._made()
         self._engine_wrapper.reset(self._episode_seed)
+
+    def _made(self) -> _engine.VisualWrappers:
+        """The wrapper in the engine, at its index in the stack, on which its random values depend."""
+        below = [["cutout", {"num": 0}]] * self._index
+        return _engine.VisualWrappers(json.dumps([*below, [self.id, self._settings]]))
 
     @classmethod
     def engine_settings(cls, *values: Any, seed: int | None = None, **settings: Any) -> dict[str, Any]:
@@ -164,6 +172,15 @@ class VisualWrapper(gymnasium.Wrapper):
         for name in [name for name in info if name == "pixels" or name.startswith("pixels.")]:
             info[name] = self.apply(info[name])
         return info
+
+
+def _count(env: Any) -> int:
+    """The number of visual wrappers of an environment."""
+    count = 0
+    while isinstance(env, gymnasium.Wrapper):
+        count += isinstance(env, VisualWrapper)
+        env = env.env
+    return count
 
 
 def _to_json(cls: type, name: str, value: Any) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ... import _engine
+from ..._overrides import engine_part
 from ..adapter import Adapter
 from .callbacks import Callback
 from .hooks import Observer, Watched, view
@@ -24,6 +25,9 @@ __all__ = ["EngineSolver", "NotConfigured", "last_step", "single", "summed_costs
 
 #: The episode's key and the number of the plan, for each row of the next call of `solve`: see `MPCPolicy`.
 PLANS: ContextVar[list[tuple[int, int]] | None] = ContextVar("PLANS", default=None)
+
+#: The scaler between the units of the next call's plans and those of the environment: see `MPCPolicy`.
+ACTION_SCALER: ContextVar[Any] = ContextVar("ACTION_SCALER", default=None)
 
 #: Held while a call of `solve` takes its number; not by the solvers, because locks cannot be pickled.
 _COUNTING = Lock()
@@ -134,7 +138,7 @@ class EngineSolver:
             if self.model != "simulator":
                 raise ValueError(f"model: {self.model!r}; load a checkpoint with swm.wm.load, or pass 'simulator'")
             return None
-        engine = getattr(self.model, "_engine_model", None)
+        engine = engine_part(self.model, "_engine_model", "get_cost")
         if engine is not None:
             return engine
         return Adapter(self.model, self.device, self.batch_size, process, transform, history, self._plan_dim)
@@ -197,6 +201,7 @@ class EngineSolver:
                 call,
                 plans,
                 observer if self.callbacks else None,
+                getattr(config, "latency_budget", None),
             )
         observer.end()
         result = {"actions": view(actions), "costs": costs.tolist(), "trace": json.loads(trace)}
@@ -229,7 +234,7 @@ class EngineSolver:
         sigma, momentum = float(settings.get("sigma", 0.0)), float(settings.get("momentum", 0.0))
         space: Any = self._space()
         limits = (space.low.copy(), space.high.copy()) if isinstance(space, spaces.Box) and self.id == "icem" else None
-        return Observer(self.callbacks, elites, sigma, momentum, limits)
+        return Observer(self.callbacks, elites, sigma, momentum, limits, fits=self.id != "mppi")
 
     def __getattr__(self, name: str) -> Any:
         if isinstance(getattr(type(self), name, None), property):
@@ -332,11 +337,14 @@ def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float
     if isinstance(space, spaces.MultiDiscrete):
         return [], [], [int(n) for n in space.nvec.reshape(-1)] * block
     low, high = (np.asarray(side, dtype=np.float32).reshape(-1) for side in (space.low, space.high))
-    info = getattr(model, "info", None)
+    info, scaler = getattr(model, "info", None), ACTION_SCALER.get()
     if info is not None:
         info = json.loads(info)
         mean, std = (np.asarray(info[name], dtype=np.float32) for name in ("action_mean", "action_std"))
         low, high = (low - mean) / std, (high - mean) / std
+    elif scaler is not None:
+        sides = np.asarray(scaler.transform(np.stack([low, high])), dtype=np.float32)
+        low, high = sides.min(0), sides.max(0)
     return np.tile(low, block).tolist(), np.tile(high, block).tolist(), None
 
 

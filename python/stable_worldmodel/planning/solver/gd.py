@@ -21,7 +21,8 @@ class GradientSolver(EngineSolver):
         var_scale: The standard deviation of the initial candidates.
         num_samples: Candidates.
         action_noise: The standard deviation of the noise that is added after every step.
-        optimizer_cls: `torch.optim.SGD` or `torch.optim.Adam`, or its name; Adam with a step of 0.1 for `None`.
+        optimizer_cls: `torch.optim.SGD` or `torch.optim.Adam`, or its name. For `None` it is Adam with a step of 0.1, or SGD
+            if there are `optimizer_kwargs`.
         optimizer_kwargs: Arguments of the optimizer.
         grad_clip: The largest norm of a candidate's gradient.
         **settings: As for `CEMSolver`.

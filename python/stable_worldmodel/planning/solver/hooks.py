@@ -25,6 +25,7 @@ class Observer:
         sigma: The initial standard deviation of sampling solvers.
         momentum: The weight of the previous distribution.
         limits: The bounds of an action, `(low, high)`, which callbacks get as `action_low` and `action_high`.
+        fits: Whether the spread is fitted to the elites; that of MPPI never changes.
     """
 
     def __init__(
@@ -34,9 +35,10 @@ class Observer:
         sigma: float,
         momentum: float,
         limits: tuple[np.ndarray, np.ndarray] | None = None,
+        fits: bool = True,
     ) -> None:
         self.callbacks = list(callbacks)
-        self.elites, self.momentum, self._sigma = elites, momentum, sigma
+        self.elites, self.momentum, self._sigma, self._fits = elites, momentum, sigma, fits
         #: The number of options of every choice of a model step, for discrete actions.
         self._options: list[int] | None = None
         self._smoothing, self._initial = 0.0, np.empty(0, np.float32)
@@ -119,7 +121,7 @@ class Observer:
         if self._options is None:
             previous = np.broadcast_to(np.asarray(self._spread, np.float32), shape).copy()
             deviation = elites.std(1, ddof=1) if self.elites > 1 else np.zeros(shape, np.float32)
-            self._spread = keep * previous + (1 - keep) * deviation
+            self._spread = keep * previous + (1 - keep) * deviation if self._fits else previous
         else:
             previous = np.broadcast_to(self._probs, shape).copy()
             sizes = np.repeat(self._options, self._options).astype(np.float32)

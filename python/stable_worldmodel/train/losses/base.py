@@ -12,7 +12,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from ...wm.pretrained import Stored
+from ..._overrides import is_overridden
+from ...wm.pretrained import Pretrained, Stored
 from ..ranks import Ranks
 
 __all__ = ["Losses", "evaluating", "unchanged_statistics", "windows"]
@@ -35,6 +36,8 @@ class Losses:
     names: tuple[str, ...] = ("loss",)
     #: Whether every rank computes the losses of the whole batch; otherwise those of its slice.
     whole_batch: ClassVar[bool] = False
+    #: Methods of the model for planning, which compute what is trained, and which the losses do not call.
+    not_called: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -50,6 +53,22 @@ class Losses:
         block = model.action_block
         self.mean, self.std = (torch.tensor(scale[name] * block, dtype=torch.float32) for name in ("mean", "std"))
         self.compile(compiled)
+
+    @classmethod
+    def check_kind(cls, kind: type[Pretrained] | None, ranks: Ranks) -> None:
+        """Checks that the losses call the methods of a class, before there is a checkpoint.
+
+        Raises:
+            TypeError: If the class overrides a method that the losses do not call.
+        """
+        if kind is None:
+            return
+        for method in cls.not_called:
+            if hasattr(kind, method) and is_overridden(kind, method):
+                raise TypeError(
+                    f"{kind.__name__}.{method}: the losses of this family call the networks of the model and would not call "
+                    f"this method; change the networks instead, or add {method} to the class after training"
+                )
 
     def compile(self, compiled: Callable[[Any], Any]) -> None:
         """Compiles the networks of the losses."""

@@ -54,8 +54,8 @@ class DinoWMLosses(Losses):
             terms["columns"] = torch.cat(errors[1:]).mean()
         if model.decoder is not None:
             with self.precision():
-                images, _ = model.decoder(info["pixels_emb"])
-            terms["reconstruction"] = (images.float() - model.frames(batch["pixels"]).flatten(0, 1)).square().mean()
+                images = model.decode(info)["reconstructed_pixels"]
+            terms["reconstruction"] = (images.float() - model.frames(batch["pixels"])).square().mean()
             loss = loss + terms["reconstruction"]
         return {"loss": loss, **terms}
 

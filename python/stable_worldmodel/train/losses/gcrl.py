@@ -24,6 +24,7 @@ LARGEST_WEIGHT = 100.0
 class GoalConditioned(Losses):
     """Base class of GCBC, GCIVL and GCIQL."""
 
+    not_called = ("encode", "predict_actions", "predict_values")
     model: GCRL
 
     def compile(self, compiled: Callable[[Any], Any]) -> None:

@@ -1,5 +1,6 @@
 """LeWM."""
 
+from . import module as module
 from .lewm import LeWM
 
 __all__ = ["LeWM"]

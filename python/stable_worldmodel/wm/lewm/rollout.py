@@ -10,22 +10,60 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules import module
 
-from .module import ConditionalBlock, Predictor, modulate
+from ..._overrides import is_overridden
+from .module import Attention, ConditionalBlock, FeedForward, Predictor, Transformer, modulate
 
 __all__ = ["roll", "rolls"]
 
 #: The number of keys up to which a GPU computes attention as sums of products.
 _FEW = 8
+#: The classes whose forward passes `roll` stands in for.
+_STOOD_IN_FOR = (Predictor, Transformer, ConditionalBlock, Attention)
+#: The classes of the parts of a predictor. `roll` calls the others for fewer steps at once than `Predictor` does.
+_KNOWN = frozenset(
+    {
+        *_STOOD_IN_FOR,
+        FeedForward,
+        nn.Dropout,
+        nn.GELU,
+        nn.Identity,
+        nn.LayerNorm,
+        nn.Linear,
+        nn.ModuleList,
+        nn.Sequential,
+        nn.SiLU,
+    }
+)
 
 
 def rolls(predictor: nn.Module) -> bool:
     """Whether `roll` computes what a predictor computes: not if it trains (dropout), was changed, compiled or has hooks."""
-    modules = list(predictor.modules())
-    changed = any(module._forward_hooks or module._forward_pre_hooks for module in modules)
-    compiled = any(getattr(module, "_compiled_call_impl", None) is not None for module in modules)
-    own = type(predictor) is Predictor and all(type(layer) is ConditionalBlock for layer in predictor.transformer.layers)
-    return own and not (changed or compiled or predictor.training)
+    if module._global_forward_hooks or module._global_forward_pre_hooks:
+        return False
+    if any(is_overridden(kind, "forward") for kind in _STOOD_IN_FOR):
+        return False
+    return _has_its_parts(predictor) and all(map(_is_unchanged, predictor.modules()))
+
+
+def _has_its_parts(predictor: nn.Module) -> bool:
+    """Whether the parts whose forward passes `roll` stands in for are those that `Predictor` builds."""
+    if type(predictor) is not Predictor or type(predictor.transformer) is not Transformer:
+        return False
+    blocks: Any = list(predictor.transformer.layers)
+    if any(type(block) is not ConditionalBlock or type(block.attn) is not Attention for block in blocks):
+        return False
+    products = [block.attn.to_qkv for block in blocks]
+    has_products = all(type(product) is nn.Linear and product.bias is None for product in products)
+    return has_products and type(predictor.dropout) is nn.Dropout
+
+
+def _is_unchanged(part: nn.Module) -> bool:
+    """Whether a part computes what its class says, for each step on its own."""
+    hooks = (part._forward_hooks, part._forward_pre_hooks, part._backward_hooks, part._backward_pre_hooks)
+    compiled = getattr(part, "_compiled_call_impl", None) is not None
+    return type(part) in _KNOWN and not (part.training or "forward" in part.__dict__ or compiled or any(hooks))
 
 
 def roll(predictor: Predictor, observed: Tensor, actions: Tensor, project: Callable[[Tensor], Tensor], history: int) -> Tensor:

@@ -1,5 +1,7 @@
 //! `meta/stats.json`: minimum, maximum, mean and standard deviation of every feature, which LeRobot's policies use for
 //! normalisation. Statistics of new episodes are merged with the stored statistics. Quantiles are not written.
+//!
+//! Values that are not finite are left out, because JSON has none. An element without finite values has `null`s.
 
 use serde_json::{Value, json};
 use swm_core::{ColumnSpec, Result};
@@ -17,6 +19,8 @@ pub struct Stats {
 /// Statistics of one element of a row, or of one colour channel.
 #[derive(Clone, Copy, Debug)]
 struct Dim {
+    /// Number of finite values, scaled to one value per row.
+    count: f64,
     min: f64,
     max: f64,
     mean: f64,
@@ -24,7 +28,7 @@ struct Dim {
     spread: f64,
 }
 
-const EMPTY: Dim = Dim { min: f64::INFINITY, max: f64::NEG_INFINITY, mean: 0.0, spread: 0.0 };
+const EMPTY: Dim = Dim { count: 0.0, min: f64::INFINITY, max: f64::NEG_INFINITY, mean: 0.0, spread: 0.0 };
 
 impl Stats {
     pub fn new(column: &ColumnSpec) -> Self {
@@ -37,8 +41,13 @@ impl Stats {
         let dim_count = self.dims.len();
         let mut added = vec![EMPTY; dim_count];
         let mut sums = vec![(0.0, 0.0, 0.0); dim_count];
+        let mut missing = vec![0.0; dim_count];
         for (i, value) in values.enumerate() {
             let (dim, sum) = (&mut added[i % dim_count], &mut sums[i % dim_count]);
+            if !value.is_finite() {
+                missing[i % dim_count] += 1.0;
+                continue;
+            }
             dim.min = dim.min.min(value);
             dim.max = dim.max.max(value);
             // Welford's algorithm.
@@ -47,27 +56,30 @@ impl Stats {
             sum.1 += delta / sum.0;
             sum.2 += delta * (value - sum.1);
         }
-        for (dim, (n, mean, spread)) in added.iter_mut().zip(&sums) {
-            dim.mean = *mean;
-            // Scaled to one value per row, because images have many values per channel and row.
-            dim.spread = if *n > 0.0 { spread / n * rows as f64 } else { 0.0 };
+        for ((dim, (n, mean, spread)), missing) in added.iter_mut().zip(&sums).zip(&missing) {
+            if *n > 0.0 {
+                // Scaled to one value per row, because images have many values per channel and row.
+                dim.count = n / (n + missing) * rows as f64;
+                dim.mean = *mean;
+                dim.spread = spread / n * dim.count;
+            }
         }
         self.merge(&added, rows as f64);
     }
 
     fn merge(&mut self, other: &[Dim], count: f64) {
-        let total = self.count + count;
-        if total == 0.0 {
-            return;
-        }
         for (dim, other) in self.dims.iter_mut().zip(other) {
-            let difference = other.mean - dim.mean;
+            let total = dim.count + other.count;
             dim.min = dim.min.min(other.min);
             dim.max = dim.max.max(other.max);
-            dim.spread += other.spread + difference * difference * self.count * count / total;
-            dim.mean += difference * count / total;
+            if total > 0.0 {
+                let difference = other.mean - dim.mean;
+                dim.spread += other.spread + difference * difference * dim.count * other.count / total;
+                dim.mean += difference * other.count / total;
+                dim.count = total;
+            }
         }
-        self.count = total;
+        self.count += count;
     }
 
     /// The JSON object that LeRobot stores. Statistics of images are in `[0, 1]`, with shape `[3, 1, 1]`.
@@ -80,18 +92,21 @@ impl Stats {
         json!({
             "min": list(&|dim| dim.min),
             "max": list(&|dim| dim.max),
-            "mean": list(&|dim| dim.mean),
-            "std": list(&|dim| (dim.spread / self.count.max(1.0)).sqrt()),
+            "mean": list(&|dim| if dim.count > 0.0 { dim.mean } else { f64::NAN }),
+            "std": list(&|dim| if dim.count > 0.0 { (dim.spread / dim.count).sqrt() } else { f64::NAN }),
             "count": [self.count],
         })
     }
 
     /// Merges stored statistics. Returns `None` if the number of elements differs.
+    ///
+    /// Stored is the number of rows, not that of the finite values of each element. An element with a stored mean counts
+    /// as finite in all of these rows, and another one as finite in none.
     pub fn continue_from(&mut self, stored: &Value) -> Option<()> {
-        let scale = if self.camera { 255.0 } else { 1.0 };
+        let number = |v: &Value| if v.is_null() { Some(f64::NAN) } else { v.as_f64() };
         let list = |name: &str| -> Option<Vec<f64>> {
             let values = stored[name].as_array()?.iter();
-            values.map(|v| Some(if self.camera { v[0][0].as_f64()? } else { v.as_f64()? } * scale)).collect()
+            values.map(|v| if self.camera { Some(v[0][0].as_f64()? * 255.0) } else { number(v) }).collect()
         };
         let count = stored["count"][0].as_f64()?;
         let (min, max, mean, std) = (list("min")?, list("max")?, list("mean")?, list("std")?);
@@ -99,7 +114,12 @@ impl Stats {
             return None;
         }
         let dims = (0..min.len())
-            .map(|i| Dim { min: min[i], max: max[i], mean: mean[i], spread: std[i] * std[i] * count })
+            .map(|i| {
+                // The minimum of a number and NaN is the number.
+                let bounds = Dim { min: EMPTY.min.min(min[i]), max: EMPTY.max.max(max[i]), ..EMPTY };
+                let is_known = mean[i].is_finite() && std[i].is_finite();
+                if is_known { Dim { count, mean: mean[i], spread: std[i] * std[i] * count, ..bounds } } else { bounds }
+            })
             .collect::<Vec<_>>();
         self.merge(&dims, count);
         Some(())
@@ -143,5 +163,38 @@ mod tests {
         let mean = even.iter().sum::<f64>() / 20.0;
         assert!((a["mean"][0].as_f64().expect("a JSON number") - mean).abs() < 1e-9);
         assert!(Stats::new(&ColumnSpec::image("pixels", 4, 4)).continue_from(&a).is_none());
+    }
+
+    #[test]
+    fn values_that_are_not_finite_are_left_out() {
+        let column = ColumnSpec::new("state", DType::Float64, [3]);
+        let (nan, infinity) = (f64::NAN, f64::INFINITY);
+        // Of the columns, the first is finite in all rows, the second in two, and the third in none.
+        let values = [1.0, nan, nan, 1.0, 4.0, infinity, 7.0, 8.0, nan, 7.0, -infinity, nan];
+        let mut stats = Stats::new(&column);
+        stats.add(values.iter().copied(), 4);
+        let text = file([("state", &stats)].into_iter()).expect("writing statistics");
+        let stored: Value = serde_json::from_slice(&text).expect("reading statistics");
+        let expected = json!({
+            "min": [1.0, 4.0, null], "max": [7.0, 8.0, null], "mean": [4.0, 6.0, null], "std": [3.0, 2.0, null],
+            "count": [4.0],
+        });
+        assert_eq!(stored["state"], expected);
+        let mut continued = Stats::new(&column);
+        continued.continue_from(&stored["state"]).expect("merging the stored statistics");
+        continued.add([4.0, 6.0, 3.0, 4.0, 6.0, 5.0].into_iter(), 2);
+        let all = continued.to_json();
+        assert_eq!(all["min"], json!([1.0, 4.0, 3.0]));
+        assert_eq!(all["max"], json!([7.0, 8.0, 5.0]));
+        assert_eq!(all["mean"], json!([4.0, 6.0, 4.0]));
+        assert_eq!(all["std"][2], json!(1.0));
+        assert_eq!(all["count"], json!([6.0]));
+        // What was written before: the extremes of finite values, and no mean.
+        let old = json!({"min": [0.0], "max": [9.0], "mean": [null], "std": [null], "count": [3.0]});
+        let mut continued = Stats::new(&ColumnSpec::new("state", DType::Float64, [1]));
+        continued.continue_from(&old).expect("merging statistics without a mean");
+        continued.add([5.0].into_iter(), 1);
+        let expected = json!({"min": [0.0], "max": [9.0], "mean": [5.0], "std": [0.0], "count": [4.0]});
+        assert_eq!(continued.to_json(), expected);
     }
 }

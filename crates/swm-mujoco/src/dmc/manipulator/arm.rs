@@ -42,8 +42,11 @@ pub struct Pose {
 /// The hand directions that [`Arm::reach`] tries: `count` of them, at most `spread` from `centre`, in radians.
 #[derive(Clone, Copy)]
 pub struct Directions {
+    /// The direction in the middle.
     pub centre: f64,
+    /// The largest difference from it.
     pub spread: f64,
+    /// The number of directions.
     pub count: usize,
     /// The cost of a squared radian from the centre, relative to turning the root by a radian.
     pub weight: f64,
@@ -54,19 +57,22 @@ fn direction(angle: f64) -> Point {
     [-angle.sin(), angle.cos()]
 }
 
+/// Returns `a + factor * b`.
 pub fn add(a: Point, b: Point, factor: f64) -> Point {
     [a[0] + factor * b[0], a[1] + factor * b[1]]
 }
 
+/// Returns `a - b`.
 pub fn difference(a: Point, b: Point) -> Point {
     add(a, b, -1.0)
 }
 
+/// Returns the length of a vector.
 pub fn length([x, z]: Point) -> f64 {
     x.hypot(z)
 }
 
-/// The angle in -π .. π.
+/// Returns the angle in -π .. π.
 pub fn wrapped(angle: f64) -> f64 {
     (angle + PI).rem_euclid(2.0 * PI) - PI
 }
@@ -89,13 +95,14 @@ fn from_segment(point: Point, [from, to]: [Point; 2]) -> f64 {
 }
 
 impl Arm {
-    /// The arm whose first link ends where the wrist is, given the other angles.
+    /// Returns the arm whose first link ends where the wrist is, given the other angles.
     pub fn with_wrist(angles: Angles, wrist: Point) -> Self {
         let without = Self { upper: 0.0 }.pose(angles).points[3];
         let (along, rest) = (direction(angles[0]), difference(wrist, without));
         Self { upper: along[0] * rest[0] + along[1] * rest[1] }
     }
 
+    /// Returns where the arm is with these angles.
     pub fn pose(self, angles: Angles) -> Pose {
         let (mut points, mut hand) = ([ROOT; 5], 0.0);
         for (i, length) in [self.upper, LINKS[0], LINKS[1], GRASP].into_iter().enumerate() {

@@ -222,6 +222,7 @@ class MixturePolicy(_EnginePolicy):
         return [{"name": name, "weight": weight} for name, weight in self.weights.items()]
 
     def _actor(self, world: World) -> Any:
+        actor = _engine.Actor.mixture(world._world, json.dumps(self._choice))
         own = _engine.Actor.experts(world.env_name) if world.env_name.partition(",")[0] in _engine.envs() else []
         models = [name for name in self.weights if name not in ("random", "expert", *own)]
         if world.transforms and models:
@@ -229,7 +230,7 @@ class MixturePolicy(_EnginePolicy):
                 f"MixturePolicy: {models[0]} acts in the engine, which does not call the world's image_transform and "
                 "goal_transform; leave them out, or play it as a FeedForwardPolicy"
             )
-        return _engine.Actor.mixture(world._world, json.dumps(self._choice))
+        return actor
 
 
 class FeedForwardPolicy(BasePolicy):
@@ -358,6 +359,8 @@ class MPCPolicy(BasePolicy):
         #: The number of plans in the episode of every environment, and of resets of the environments of an `EnvPool`.
         self._planned: list[int] = []
         self._resets = np.zeros(0, np.int64)
+        #: The last scaler of actions, with its mean and deviation.
+        self._known_scale: tuple[Any, tuple[list[float], list[float]] | None] | None = None
         self._done: list[HistoryBuffer] = []
 
     @property
@@ -380,17 +383,13 @@ class MPCPolicy(BasePolicy):
     @property
     def _scaler(self) -> Any:
         """The scaler of actions: the given one, or that of the checkpoint; `None` if plans are in the environment's units."""
-        card = getattr(getattr(self.solver, "model", None), "card", None)
-        if "action" in self.process or not isinstance(card, Mapping) or "action_mean" not in card:
+        if "action" in self.process or not isinstance(self.solver, EngineSolver):
             return self.process.get("action")
-        return _CheckpointScaler(card)
+        card = getattr(self.solver.model, "card", None)
+        return _CheckpointScaler(card) if isinstance(card, Mapping) and "action_mean" in card else None
 
     def _actor(self, world: World) -> Any:
         if not isinstance(self.solver, EngineSolver) or is_overridden(self.solver, "solve"):
-            return None
-        scaler = self._scaler
-        scale = None if scaler is None else _scale(scaler, single(world.envs.action_space, world.num_envs))
-        if scale is None and scaler is not None:
             return None
         # Another world may have taken the solver meanwhile.
         self.solver.configure(action_space=world.envs.action_space, n_envs=world.num_envs, config=self.cfg)
@@ -399,22 +398,33 @@ class MPCPolicy(BasePolicy):
             raise ValueError(
                 "the simulator plays environments without wrappers written in Python; plan in a World that has none"
             )
-        model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
-        if isinstance(model, _engine.Model) and (self.process or self.transform):
+        engine = engine_part(self.solver.model, "_engine_model", "get_cost")
+        if engine is not None and (self.process or self.transform):
             raise ValueError("MPCPolicy: models of swm.wm scale their inputs themselves; remove process and transform")
         if world.transforms and not simulates:
-            if isinstance(model, _engine.Model) and self.cfg.history_len > 1:
+            if engine is not None and self.cfg.history_len > 1:
                 raise ValueError(
                     "MPCPolicy: models of swm.wm get no history in a world with image_transform; use history_len=1"
                 )
             # Transforms of frames are functions in Python, so the solver is called from here.
             return None
+        scaler = None if engine is not None else self._scaler
+        scale = None if scaler is None else self._scale_of(scaler, single(world.envs.action_space, world.num_envs))
+        if scale is None and scaler is not None:
+            return None
+        model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
         cfg = asdict(self.cfg)
         cfg["history"] = cfg.pop("history_len")
         settings = json.dumps(self.solver.settings)
         seed, observer = self.solver.seed, self.solver._observer() if self.solver.callbacks else None
         plan = json.dumps(cfg)
         return _engine.Actor.planning(world._world, self.solver.id, settings, plan, scale, model, seed, observer)
+
+    def _scale_of(self, scaler: Any, space: Any) -> tuple[list[float], list[float]] | None:
+        """See `_scale`; a scaler is asked once, because `World.step` may ask in every step."""
+        if self._known_scale is None or self._known_scale[0] is not scaler:
+            self._known_scale = (scaler, _scale(scaler, space))
+        return self._known_scale[1]
 
     # Planning in Python, for user-defined solvers.
 
@@ -574,19 +584,34 @@ def _scale(scaler: Any, space: Any) -> tuple[list[float], list[float]] | None:
     size = int(np.prod(space.shape or (1,)))
     for names in (("mean", "std"), ("mean_", "scale_")):
         if all(getattr(scaler, name, None) is not None for name in names):
-            values = [getattr(scaler, name) for name in names]
-            values = [n.detach().cpu().numpy() if hasattr(n, "detach") else n for n in values]
+            given = [getattr(scaler, name) for name in names]
             try:
-                mean, std = (np.broadcast_to(np.asarray(n, dtype=np.float32).reshape(-1), size) for n in values)
-                given = np.outer(_PROBES, np.ones(size, np.float32))
-                back = np.asarray(scaler.inverse_transform(given), dtype=np.float32)
-                there = np.asarray(scaler.transform(given), dtype=np.float32)
-            except (TypeError, ValueError, AttributeError):
+                mean, std = (np.broadcast_to(_array(value).reshape(-1), size) for value in given)
+            except (TypeError, ValueError):
                 return None
-            is_linear = np.all(std > 0) and np.allclose(back, given * std + mean, 1e-4, 1e-5)
-            is_linear = is_linear and np.allclose(there, (given - mean) / std, 1e-4, 1e-5)
+            is_linear = np.all(std > 0) and _converts_with(scaler, mean, std, given[0])
             return (mean.tolist(), std.tolist()) if is_linear else None
     return None
+
+
+def _converts_with(scaler: Any, mean: np.ndarray, std: np.ndarray, like: Any) -> bool:
+    """Whether a scaler converts actions with this mean and deviation. One that fails on a few actions is taken at its word."""
+    given = np.outer(_PROBES, np.ones_like(mean))
+    try:
+        probes: Any = given
+        if hasattr(like, "detach"):
+            import torch
+
+            probes = torch.as_tensor(given, dtype=like.dtype, device=like.device)
+        there, back = _array(scaler.transform(probes)), _array(scaler.inverse_transform(probes))
+    except Exception:
+        return True
+    expected = ((there, (given - mean) / std), (back, given * std + mean))
+    return all(found.shape == wanted.shape and np.allclose(found, wanted, 1e-4, 1e-5) for found, wanted in expected)
+
+
+def _array(value: Any) -> np.ndarray:
+    return np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value, dtype=np.float32)
 
 
 #: Values at which a scaler shows whether it is what its mean and deviation say.

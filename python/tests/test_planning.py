@@ -741,6 +741,43 @@ def test_scaler_converts_actions_itself_where_it_is_not_its_mean_and_deviation()
     assert np.allclose(executed(solver, {"action": Bent(np.zeros(2), np.ones(2) / 2)}), np.tanh(0.5), atol=0.02)
 
 
+class Tensors:
+    """A scaler whose mean and deviation are tensors, and which converts tensors only."""
+
+    def __init__(self, kind):
+        self.mean, self.std = kind(torch.zeros(2)), kind(torch.full((2,), 0.25))
+
+    def transform(self, actions):
+        return (actions - self.mean) / self.std
+
+    def inverse_transform(self, actions):
+        return actions * self.std + self.mean
+
+
+@pytest.mark.skipif(torch is None, reason="needs torch")
+@pytest.mark.parametrize("kind", ["tensors", "parameters"])
+def test_scalers_of_tensors_plan_in_the_engine(kind):
+    solver = solvers.MPPISolver(Nearest(), num_samples=128, n_steps=20, seed=0)
+    scaler = Tensors(torch.nn.Parameter if kind == "parameters" else torch.as_tensor)
+    assert np.allclose(executed(solver, {"action": scaler}), 0.95, atol=0.05)
+
+
+def test_scalers_without_finite_bounds_do_not_bound_plans():
+    class Logarithm:
+        def transform(self, actions):
+            return np.log(np.asarray(actions) + 0.5)
+
+        def inverse_transform(self, plans):
+            return np.exp(plans) - 0.5
+
+    class Half:
+        def get_cost(self, infos, candidates):
+            return ((candidates - np.log(0.9)) ** 2).sum((2, 3))
+
+    solver = solvers.CEMSolver(Half(), num_samples=128, n_steps=20, topk=8, seed=0)
+    assert np.allclose(executed(solver, {"action": Logarithm()}), 0.4, atol=0.05)
+
+
 @pytest.mark.parametrize("world", [{}, {"image_transform": lambda frame: frame}])
 def test_searches_end_after_their_budget(world):
     class Slow:
@@ -767,10 +804,17 @@ def test_transforms_of_frames_reach_the_models_of_the_engine():
             world.reset(seed=1)
             world.step()
             actions.append(world.infos["action"].copy())
-            world.set_policy(swm.policy.MixturePolicy({"random": 1, "zoo:cartpole-swingup/expert": 1}))
-            with pytest.raises(ValueError, match="image_transform"):
-                world.step()
     assert not np.allclose(*actions, atol=1e-2)
+
+
+def test_mixtures_with_checkpoints_refuse_transforms_of_frames():
+    with swm.World(
+        "swm/CartpoleDMControl-v0", 1, add_pixels=False, task="swingup", image_transform=lambda frame: frame
+    ) as world:
+        world.set_policy(swm.policy.MixturePolicy({"random": 1, "zoo:cartpole-swingup/expert": 1}))
+        world.reset(seed=1)
+        with pytest.raises(ValueError, match="image_transform"):
+            world.step()
 
 
 def test_checkpoints_that_act_take_paths_and_no_scalers(tmp_path):

@@ -662,6 +662,16 @@ def test_the_seed_of_a_policy_is_recorded_and_continued(tmp_path):
     assert swm.data.load_dataset(tmp_path / "e.lance").manifest["config"]["policy"] == "expert"
 
 
+def test_the_factors_of_an_episode_pin_it_again():
+    world = rooms(num_envs=1)
+    for colour in ([1, 0, 1], [255, 128, 0]):
+        world.reset(seed=1, options={"variation_values": {"wall.color": colour}})
+        seen, factors = world.infos["pixels"].copy(), world.factors()
+        assert factors["wall.color"] == colour
+        world.reset(seed=1, options={"variation_values": factors})
+        assert (world.infos["pixels"] == seen).all()
+
+
 class Signed(gym.Env):
     """Has an action space that contains -1, and a frame of random pixels."""
 

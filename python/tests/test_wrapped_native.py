@@ -209,3 +209,24 @@ def test_stacked_wrappers_draw_as_in_the_engine():
     env = NoiseWrapper(NoiseWrapper(gymnasium.make("swm/TwoRoom-v1", image_shape=(32, 32)), std=10.0), std=10.0)
     env.reset(seed=7)
     assert np.array_equal(pickle.loads(pickle.dumps(env)).render(), env.render())
+
+
+def test_a_policy_of_the_user_may_convert_the_actions_of_an_expert():
+    class Doubled(swm.policy.ExpertPolicy):
+        def get_action(self, obs, **named):
+            return 2 * super().get_action(obs)
+
+    class Rescaled(gymnasium.wrappers.RescaleAction):
+        def __init__(self, env):
+            super().__init__(env, -2.0, 2.0)
+
+    with swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32), extra_wrappers=[Rescaled]) as world:
+        world.set_policy(Doubled())
+        world.reset(seed=1)
+        largest = 0.0
+        for _ in range(100):
+            world.step()
+            largest = max(largest, float(np.nanmax(np.abs(world.infos["action"]))))
+            if world.terminateds.any():
+                break
+        assert world.terminateds.any() and 1 < largest <= 2

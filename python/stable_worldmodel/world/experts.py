@@ -14,25 +14,33 @@ if TYPE_CHECKING:
 __all__ = ["check_experts"]
 
 
-def check_experts(world: World, policy: Any) -> None:
+def check_experts(world: World, policy: Any, *, is_asked: bool) -> None:
     """Checks that the experts of a policy can play the environments of a world, which are in wrappers written in Python.
 
     An expert reads the columns of the native environment and writes its actions. Any changed column is refused, because
     the engine does not state which columns an expert reads.
 
+    Args:
+        world: The world.
+        policy: The policy.
+        is_asked: Whether a policy of the user asks the expert, and may convert its actions to another space of this shape.
+
     Raises:
         ValueError: When the wrappers change the action space or a column.
     """
+    from ..envs.native import NativeEnv
+
     name = world.env_name.partition(",")[0]
     if name not in _engine.envs() or not _plays_expert(policy, world.env_name):
         return
     wrapper, native = world.gym_envs[-world.num_envs], None
     while wrapper is not None and native is None:
-        native = wrapper if hasattr(wrapper, "_columns") else None
+        native = wrapper if isinstance(wrapper, NativeEnv) else None
         wrapper = getattr(wrapper, "env", None)
     if native is None:
         raise _refused(name, f"hide {name} itself")
-    if world.single_action_space != native.action_space:
+    given, own = world.single_action_space, native.action_space
+    if given != own and not (is_asked and (given.shape, given.dtype) == (own.shape, own.dtype)):
         raise _refused(name, f"change the action space from {native.action_space} to {world.single_action_space}")
     if world.seed is None:
         # The infos have no episode yet. Whatever plays next begins with a reset.

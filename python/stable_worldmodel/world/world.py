@@ -102,7 +102,7 @@ class World:
         if isinstance(views, str):
             raise TypeError(f"views: {views!r}; expected a list, such as [{views!r}]")
         nearest = _gym.is_nearest(image_resample)
-        if nearest is not None and workers:
+        if nearest is not None and workers and not self._is_native(env_name):
             raise ValueError(
                 f"image_resample: {image_resample!r}; worker processes resize as the environment's attribute swm_pixel_art "
                 "says; set it, or use workers=False"
@@ -232,8 +232,10 @@ class World:
         return self._world.max_episode_steps()
 
     def factors(self, index: int = 0) -> dict[str, list[float]]:
-        """The factors of the current episode of an environment, by key."""
-        return self._world.factors(self._checked_index(index))
+        """The factors of the current episode of an environment, by key. Colours are whole numbers from 0 to 255."""
+        spaces, factors = self.spec["variation"], self._world.factors(self._checked_index(index))
+        colours = [key for key in factors if key in spaces and spaces[key]["type"] == "RGBBox"]
+        return {**factors, **{key: [int(channel) for channel in factors[key]] for key in colours}}
 
     def close(self) -> None:
         """Closes the environments and ends their worker processes. The world cannot be used afterwards."""
@@ -514,7 +516,8 @@ class World:
             return known[1]
         make = getattr(policy, "_actor", None)
         if make is not None and self._wrapped_in_python:
-            check_experts(self, policy)
+            # A policy of the user that asks an expert may convert its actions.
+            check_experts(self, policy, is_asked=is_overridden(policy, "get_action") or policy is not self.policy)
         actor = make(self) if make is not None else None
         if actor is not None:
             self._actors[id(policy)] = (_reference(policy, self._actors), actor)
@@ -579,7 +582,7 @@ class World:
             dataset_path: Another name for `path`.
             policy: The policy to set first; `None` keeps the policy of `set_policy`. A dict of weights by policy name, such as
                 `{"expert": 0.7, "random": 0.3}`, stands for `swm.policy.MixturePolicy`. The manifest has the policy's name,
-                and its `seed` if it has one: `random,seed=3`.
+                and the `seed` of a policy of the engine: `random,seed=3`.
             mode: The treatment of an existing dataset: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
                 more, `"resume"` continues until the dataset has `episodes`.
             codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
@@ -805,7 +808,7 @@ def _literal(value: Any) -> Any:
         return value
     try:
         ast.literal_eval(value)
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         is_text = value not in ("true", "false", "none") and not any(sign in value for sign in ",'\"()[]{}")
         return value if is_text else repr(value)
     return repr(value)
@@ -859,8 +862,9 @@ def _check_storable(space: spaces.Space[Any]) -> None:
 
 
 def _recorded(policy: Any) -> str:
-    """The name of a policy with its seed, which decides what is collected."""
-    seed = getattr(policy, "seed", None)
+    """The name of a policy, and of one of the engine its seed, which decides what is collected."""
+    own = hasattr(policy, "_actor") and not is_overridden(policy, "get_action")
+    seed = getattr(policy, "seed", None) if own else None
     seeded = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
     return f"{_name(policy)},seed={seed}" if seeded else _name(policy)
 

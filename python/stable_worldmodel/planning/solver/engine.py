@@ -343,9 +343,30 @@ def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float
         mean, std = (np.asarray(info[name], dtype=np.float32) for name in ("action_mean", "action_std"))
         low, high = (low - mean) / std, (high - mean) / std
     elif scaler is not None:
-        sides = np.asarray(scaler.transform(np.stack([low, high])), dtype=np.float32)
-        low, high = sides.min(0), sides.max(0)
+        low, high = _scaled(scaler, np.stack([low, high]))
     return np.tile(low, block).tolist(), np.tile(high, block).tolist(), None
+
+
+def _scaled(scaler: Any, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The bounds of actions in the units of plans. A side that has no finite value there is no bound."""
+    is_bound = np.isfinite(sides)
+    given = np.where(is_bound, sides, 0).astype(np.float32)
+    try:
+        with np.errstate(all="ignore"):
+            scaled = np.asarray(scaler.transform(given), dtype=np.float32)
+    except Exception as error:
+        raise ValueError(
+            f"process['action']: its transform fails for bounds of actions of shape {given.shape}: {error}"
+        ) from error
+    if scaled.shape != sides.shape:
+        raise ValueError(
+            f"process['action']: its transform gives the shape {scaled.shape} for bounds of actions of shape {sides.shape}; "
+            "expected the same shape: give a scaler of single actions"
+        )
+    known = is_bound & np.isfinite(scaled)
+    lowest = np.where(known.all(0), scaled.min(0), -np.inf)
+    highest = np.where(known.all(0), scaled.max(0), np.inf)
+    return lowest.astype(np.float32), highest.astype(np.float32)
 
 
 def _padded(init: Any, envs: int, horizon: int, dim: int) -> np.ndarray:

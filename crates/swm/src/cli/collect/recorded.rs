@@ -175,7 +175,11 @@ pub fn unknown_policy(error: anyhow::Error) -> anyhow::Error {
     match error.downcast::<Error>() {
         Ok(Error::UnknownName { kind: "policy", given, .. }) => {
             let problem = "the dataset was collected with it, and no expert and no checkpoint has this name";
-            let fix = "name the path of its checkpoint with --policy, or continue in Python (World.collect with mode='append')";
+            let fix = if given.contains(",seed=") {
+                "continue in Python, where policies have seeds (World.collect with mode='append')"
+            } else {
+                "name the path of its checkpoint with --policy, or continue in Python (World.collect with mode='append')"
+            };
             Error::config(format!("policy '{given}'"), problem, fix).into()
         }
         Ok(other) => other.into(),

@@ -110,8 +110,11 @@ class JEPA(Pretrained):
         from .lewm.rollout import roll, rolls
 
         predictor: Any = self.predictor
-        # Whoever compiles this has the model's own predictions, and the check cannot be compiled.
-        is_own = torch.compiler.is_compiling() or not (is_overridden(self, "predict") or self.pred_proj.training)
+        if torch.compiler.is_compiling():
+            # `torch.compile` cannot follow the whole check.
+            is_own = type(self).predict is JEPA.predict
+        else:
+            is_own = not (is_overridden(self, "predict") or self.pred_proj.training)
         if is_own and history <= getattr(predictor, "num_frames", 0) and rolls(predictor):
             rolled: Tensor = (self._roll or roll)(predictor, observed, actions, self.pred_proj, history)
             return rolled

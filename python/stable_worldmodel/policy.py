@@ -19,6 +19,7 @@ import numpy as np
 from . import _engine, _options
 from ._overrides import engine_part, is_overridden
 from .buffer import HistoryBuffer
+from .data.normalization import ZScoreScaler
 from .planning.adapter import has_torch, prepared
 from .planning.solver.engine import ACTION_SCALER, PLANS, EngineSolver, NotConfigured, single
 
@@ -375,6 +376,8 @@ class MPCPolicy(BasePolicy):
         self._rest = {}
         self._planned = [0] * env.num_envs
         self._resets = np.zeros(env.num_envs, np.int64)
+        # The scaler may have been fitted again.
+        self._known_scale = None
         steps = max(1, (self.cfg.history_len - 1) * self.cfg.action_block)
         block = self.cfg.action_block
         self._seen = [HistoryBuffer(1, steps + 1, block) for _ in range(env.num_envs)]
@@ -386,7 +389,10 @@ class MPCPolicy(BasePolicy):
         if "action" in self.process or not isinstance(self.solver, EngineSolver):
             return self.process.get("action")
         card = getattr(self.solver.model, "card", None)
-        return _CheckpointScaler(card) if isinstance(card, Mapping) and "action_mean" in card else None
+        if not (isinstance(card, Mapping) and "action_mean" in card):
+            return None
+        mean, std = (np.asarray(card[name], dtype=np.float32) for name in ("action_mean", "action_std"))
+        return ZScoreScaler(mean, std)
 
     def _actor(self, world: World) -> Any:
         if not isinstance(self.solver, EngineSolver) or is_overridden(self.solver, "solve"):
@@ -461,8 +467,8 @@ class MPCPolicy(BasePolicy):
             if not over[i]:
                 actions[i] = self._actions[i].pop(0).reshape(shape)
         if self.cfg.history_len > 1:
-            units = actions.reshape(envs, -1)
-            units = units if self._scaler is None else np.asarray(self._scaler.transform(units))
+            units, scaler = actions.reshape(envs, -1), self._scaler
+            units = units if scaler is None else np.asarray(scaler.transform(units))
             for i in np.flatnonzero(~over).tolist():
                 self._done[i].append({"action": units[i : i + 1].astype(np.float32)})
         return actions
@@ -564,19 +570,6 @@ def _executed(step: np.ndarray, space: Any) -> np.ndarray:
     start = np.asarray(getattr(space, "start", 0))
     action: np.ndarray = np.asarray(choices, dtype=space.dtype) + start
     return action
-
-
-class _CheckpointScaler:
-    """The scaler of a checkpoint's actions, from its card."""
-
-    def __init__(self, card: Mapping[str, Any]) -> None:
-        self.mean, self.std = (np.asarray(card[name], dtype=np.float32) for name in ("action_mean", "action_std"))
-
-    def transform(self, actions: Any) -> Any:
-        return (actions - self.mean) / self.std
-
-    def inverse_transform(self, actions: Any) -> Any:
-        return actions * self.std + self.mean
 
 
 def _scale(scaler: Any, space: Any) -> tuple[list[float], list[float]] | None:

@@ -10,6 +10,8 @@ mod ball_in_cup;
 mod cartpole;
 mod cheetah;
 mod domain;
+#[cfg(test)]
+mod expert_test;
 mod factors;
 mod finger;
 mod goal;

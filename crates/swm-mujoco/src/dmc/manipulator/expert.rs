@@ -274,29 +274,13 @@ impl Expert for Controller {
 #[cfg(test)]
 mod tests {
     use super::super::ENTRY;
-    use swm_core::{Action, Batch, Key, ResetOptions, Schema};
+    use crate::dmc::expert_test::last_rewards;
 
     /// Over 50 episodes the mean is 679 of 1000, and the lowest return 241.
     #[test]
     fn most_balls_are_brought_and_held() {
-        let mut env = ENTRY.env().expect("creating the environment");
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
-        let mut expert = (ENTRY.experts[0].make)();
-        let mut held = 0;
-        for seed in 0..5 {
-            env.reset(seed, &ResetOptions::default()).expect("resetting the environment");
-            expert.begin(Key::new(seed));
-            let mut last = 0.0;
-            for _ in 0..env.spec().max_episode_steps {
-                env.observe(&mut row.row_mut(0));
-                let mut action = [0.0; 5];
-                expert.act(row.row(0), &mut action).expect("choosing an action");
-                let stepped = env.step(Action::Continuous(&action.map(|a| a as f32)));
-                last = stepped.expect("stepping the environment").reward;
-            }
-            // Two control steps at the target.
-            held += u32::from(last > 1.9);
-        }
+        // Two control steps at the target.
+        let held = last_rewards(&ENTRY, 5, 500).into_iter().filter(|reward| *reward > 1.9).count();
         assert!(held >= 4, "{held} of 5");
     }
 }

@@ -135,29 +135,13 @@ impl Expert for Controller {
 #[cfg(test)]
 mod tests {
     use super::super::ENTRY;
-    use swm_core::{Action, Batch, Key, ResetOptions, Schema};
+    use crate::dmc::expert_test::last_rewards;
 
     /// 11 of 64 episodes begin upright or on the side; the others begin on the back.
     #[test]
     fn it_stands_and_walks_at_the_end_of_most_episodes() {
-        let mut env = ENTRY.env().expect("creating the environment");
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
-        let mut expert = (ENTRY.experts[0].make)();
-        let mut walking = 0;
-        for seed in 0..4 {
-            env.reset(seed, &ResetOptions::default()).expect("resetting the environment");
-            expert.begin(Key::new(seed));
-            let mut last = 0.0;
-            for _ in 0..300 {
-                env.observe(&mut row.row_mut(0));
-                let mut action = [0.0; 12];
-                expert.act(row.row(0), &mut action).expect("choosing an action");
-                let stepped = env.step(Action::Continuous(&action.map(|a| a as f32)));
-                last = stepped.expect("stepping the environment").reward;
-            }
-            // Two control steps; 1 for standing still.
-            walking += u32::from(last > 1.9);
-        }
+        // Of two control steps; 1 for standing still.
+        let walking = last_rewards(&ENTRY, 4, 300).into_iter().filter(|reward| *reward > 1.9).count();
         assert!(walking >= 3, "{walking} of 4");
     }
 }

@@ -7,6 +7,8 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
+use swm::leaderboard::Entry;
+use swm_core::results::{Comparison, Run};
 
 /// The largest image that the fuzzers decode, in bytes of its pixels. A dataset states the size of its images, so an
 /// image of another size is refused before it is decoded.
@@ -71,6 +73,21 @@ fn files(path: &Path) -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> = entries.flat_map(|entry| files(&entry.expect("an entry").path())).collect();
     found.sort();
     found
+}
+
+/// Returns an entry of a leaderboard with three episodes of the floor and of a policy.
+pub fn entry() -> Entry {
+    let mut entry = Entry::read(&repository("leaderboard/two-room-lewm.json")).expect("an entry");
+    let results = &mut entry.results;
+    results.manifest.config["episodes"] = 3.into();
+    results.manifest.config["policies"].as_array_mut().expect("policies").truncate(2);
+    results.runs.truncate(2);
+    for run in &mut results.runs {
+        let episodes = run.episodes[..3].to_vec();
+        *run = Run::new(&run.condition, &run.policy, results.counting, episodes, run.timing.clone());
+    }
+    results.comparisons = Comparison::all(&results.runs, results.counting);
+    entry.sealed().expect("an entry")
 }
 
 /// Copies of datasets or checkpoints in memory. The input replaces one file of one of them: its first byte is the index

@@ -273,6 +273,11 @@ impl EvalRequest {
                 let given = version.map_or("?".to_owned(), |version| version.to_string());
                 Err(invalid(format!("its request has layout {given}; this version reads {}", Self::VERSION)))
             }
+            None if manifest.config.get("front").and_then(Value::as_str) == Some("python") => Err(Error::config(
+                "the results' manifest",
+                "a program in Python made them with World.evaluate, whose policies and environments this program cannot play",
+                "run that program again, or evaluate with `swm eval`",
+            )),
             None => Err(invalid("it contains no request, because an older version wrote it".to_owned())),
         }
     }

@@ -90,9 +90,14 @@ impl Panels {
         self.fill_from(starts.len(), (rows, starts));
     }
 
-    fn fill_from(&mut self, inputs: usize, (rows, starts): (&[f32], impl Starts)) {
+    /// Changes the number of rows; the elements are any.
+    pub(crate) fn resize(&mut self, inputs: usize) {
         self.inputs = inputs;
         self.elements.resize(self.bias.len() * inputs, ZERO);
+    }
+
+    fn fill_from(&mut self, inputs: usize, (rows, starts): (&[f32], impl Starts)) {
+        self.resize(inputs);
         for (index, panel) in self.elements.chunks_exact_mut(inputs.max(1)).enumerate() {
             let first = index * WIDTH;
             let width = WIDTH.min(self.outputs - first);

@@ -43,6 +43,26 @@ pub(crate) struct Segment {
     pub length: usize,
 }
 
+/// The elements of a panel in one row of its matrix.
+pub(crate) trait PanelRow {
+    /// Returns one of the vectors of the row.
+    fn vector(&self, index: usize) -> &[f32; LANES];
+}
+
+impl PanelRow for Pair {
+    #[inline(always)]
+    fn vector(&self, index: usize) -> &[f32; LANES] {
+        &self[index].0
+    }
+}
+
+impl PanelRow for [f32; WIDTH] {
+    #[inline(always)]
+    fn vector(&self, index: usize) -> &[f32; LANES] {
+        &self.as_chunks().0[index]
+    }
+}
+
 /// The left operand of a product.
 pub(crate) trait Operand: Copy {
     /// Whether the operand is transposed and the product is added to the previous result.
@@ -50,10 +70,10 @@ pub(crate) trait Operand: Copy {
 
     /// Returns `sums` with the terms of rows `row .. row + R` and of `W` vectors of a panel. The sums are values, because the compiler
     /// keeps what it has a reference to in memory wherever a check of bounds could panic.
-    fn accumulate<L: Level, const R: usize, const W: usize>(
+    fn accumulate<L: Level, P: PanelRow, const R: usize, const W: usize>(
         self,
         row: usize,
-        panel: &[Pair],
+        panel: &[P],
         first: usize,
         sums: [[Vector<L>; W]; R],
     ) -> [[Vector<L>; W]; R];
@@ -86,18 +106,18 @@ fn add_term<L: Level, const W: usize>(sums: &mut [Vector<L>; W], x: f32, weights
 
 /// Loads `W` vectors of a row of a panel.
 #[inline(always)]
-fn load<L: Level, const W: usize>(pair: &Pair, first: usize) -> [Vector<L>; W] {
-    std::array::from_fn(|w| L::f32x16().load(&pair[first + w].0))
+fn load<L: Level, const W: usize>(row: &impl PanelRow, first: usize) -> [Vector<L>; W] {
+    std::array::from_fn(|w| L::f32x16().load(row.vector(first + w)))
 }
 
 impl<S: Starts> Operand for Rows<'_, S> {
     const ADDS: bool = false;
 
     #[inline(always)]
-    fn accumulate<L: Level, const R: usize, const W: usize>(
+    fn accumulate<L: Level, P: PanelRow, const R: usize, const W: usize>(
         self,
         row: usize,
-        panel: &[Pair],
+        panel: &[P],
         first: usize,
         mut sums: [[Vector<L>; W]; R],
     ) -> [[Vector<L>; W]; R] {
@@ -138,10 +158,10 @@ impl<S: Starts> Operand for Columns<'_, S> {
     const ADDS: bool = true;
 
     #[inline(always)]
-    fn accumulate<L: Level, const R: usize, const W: usize>(
+    fn accumulate<L: Level, P: PanelRow, const R: usize, const W: usize>(
         self,
         row: usize,
-        panel: &[Pair],
+        panel: &[P],
         first: usize,
         mut sums: [[Vector<L>; W]; R],
     ) -> [[Vector<L>; W]; R] {
@@ -186,49 +206,60 @@ impl<X: Operand, S: Starts> Kernel for Product<'_, X, S> {
         for (index, bias) in self.weights.bias.iter().enumerate() {
             let panel =
                 Panel { first: index * WIDTH, elements: &self.weights.elements[index * inputs..][..inputs], bias };
-            // The first tiles have as many rows as the registers hold, and smaller tiles compute the remaining rows.
-            let mut row = 0;
-            if L::CPU == CpuLevel::Avx512 {
-                while rows - row >= 12 {
-                    self.tile::<L, 12, 2>(row, panel);
-                    row += 12;
-                }
-                if rows - row >= 8 {
-                    self.tile::<L, 8, 2>(row, panel);
-                    row += 8;
-                }
-                if rows - row >= 4 {
-                    self.tile::<L, 4, 2>(row, panel);
-                    row += 4;
-                }
-            } else {
-                while rows - row >= 6 {
-                    self.tile::<L, 6, 1>(row, panel);
-                    row += 6;
-                }
-            }
-            while row < rows {
-                self.tile::<L, 1, 2>(row, panel);
-                row += 1;
-            }
+            for_tiles::<L>(rows, &mut (&mut self, panel));
         }
     }
 }
 
-impl<X: Operand, S: Starts> Product<'_, X, S> {
-    /// Computes `R` rows of a panel, `W` vectors at a time.
+/// A product of some rows with one panel.
+trait Tiles {
+    /// Computes `R` rows, `W` vectors at a time.
+    fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize);
+}
+
+/// Computes `rows` rows. The first tiles have as many rows as the registers hold, and smaller tiles compute the remaining rows.
+#[inline(always)]
+fn for_tiles<L: Level>(rows: usize, product: &mut impl Tiles) {
+    let mut row = 0;
+    if L::CPU == CpuLevel::Avx512 {
+        while rows - row >= 12 {
+            product.tile::<L, 12, 2>(row);
+            row += 12;
+        }
+        if rows - row >= 8 {
+            product.tile::<L, 8, 2>(row);
+            row += 8;
+        }
+        if rows - row >= 4 {
+            product.tile::<L, 4, 2>(row);
+            row += 4;
+        }
+    } else {
+        while rows - row >= 6 {
+            product.tile::<L, 6, 1>(row);
+            row += 6;
+        }
+    }
+    while row < rows {
+        product.tile::<L, 1, 2>(row);
+        row += 1;
+    }
+}
+
+impl<X: Operand, S: Starts> Tiles for (&mut Product<'_, X, S>, Panel<'_>) {
     #[inline(always)]
-    fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize, panel: Panel<'_>) {
+    fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize) {
+        let (product, panel) = self;
         for half in (0..WIDTH / LANES).step_by(W) {
             let first = panel.first + half * LANES;
-            if first >= self.weights.outputs {
+            if first >= product.weights.outputs {
                 break;
             }
             let sums = [load::<L, W>(panel.bias, half); R];
-            let sums = self.x.accumulate::<L, R, W>(row, panel.elements, half, sums);
-            let width = (self.weights.outputs - first).min(W * LANES);
+            let sums = product.x.accumulate::<L, _, R, W>(row, panel.elements, half, sums);
+            let width = (product.weights.outputs - first).min(W * LANES);
             for r in 0..R {
-                let to = &mut self.y.0[self.y.1.of(row + r) + first..][..width];
+                let to = &mut product.y.0[product.y.1.of(row + r) + first..][..width];
                 if let Some(to) = to.as_chunks_mut::<LANES>().0.first_chunk_mut::<W>() {
                     store::<L, W, X>(&sums[r], to);
                 } else {
@@ -236,6 +267,63 @@ impl<X: Operand, S: Starts> Product<'_, X, S> {
                     whole.as_flattened_mut()[..width].copy_from_slice(to);
                     store::<L, W, X>(&sums[r], &mut whole);
                     to.copy_from_slice(&whole.as_flattened()[..width]);
+                }
+            }
+        }
+    }
+}
+
+/// What follows a product in [`multiply_panel`].
+#[derive(Clone, Copy)]
+pub(crate) enum Then<'a> {
+    /// Nothing.
+    Nothing,
+    /// A bias for each row.
+    Bias(&'a [f32]),
+    /// A bias for each row, then ReLU; NaN stays NaN.
+    BiasRelu(&'a [f32]),
+    /// 0 where an element of an array of the same shape is not positive.
+    WherePositive(&'a [[f32; WIDTH]]),
+}
+
+/// Replaces `y` by the product of as many rows of `x` with one panel.
+pub(crate) fn multiply_panel<X: Operand>(x: X, panel: &[[f32; WIDTH]], y: &mut [[f32; WIDTH]], then: Then<'_>) {
+    dispatch(PanelProduct { x, panel, y, then });
+}
+
+struct PanelProduct<'a, X> {
+    x: X,
+    panel: &'a [[f32; WIDTH]],
+    y: &'a mut [[f32; WIDTH]],
+    then: Then<'a>,
+}
+
+impl<X: Operand> Kernel for PanelProduct<'_, X> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<L: Level>(mut self) {
+        for_tiles::<L>(self.y.len(), &mut self);
+    }
+}
+
+impl<X: Operand> Tiles for PanelProduct<'_, X> {
+    #[inline(always)]
+    fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize) {
+        let simd = L::f32x16();
+        for half in (0..WIDTH / LANES).step_by(W) {
+            let sums = [[simd.splat(0.0); W]; R];
+            let sums = self.x.accumulate::<L, _, R, W>(row, self.panel, half, sums);
+            for r in 0..R {
+                for w in 0..W {
+                    let sum = sums[r][w];
+                    let value = match self.then {
+                        Then::Nothing => sum,
+                        Then::Bias(bias) => simd.add(sum, simd.splat(bias[row + r])),
+                        Then::BiasRelu(bias) => simd.max(simd.splat(0.0), simd.add(sum, simd.splat(bias[row + r]))),
+                        Then::WherePositive(y) => simd.where_positive(simd.load(y[row + r].vector(half + w)), sum),
+                    };
+                    simd.store(value, &mut self.y[row + r].as_chunks_mut().0[half + w]);
                 }
             }
         }

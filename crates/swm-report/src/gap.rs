@@ -56,8 +56,9 @@ fn is_same_policy(results: &[(PathBuf, Results)], a: &Row<'_>, b: &Row<'_>) -> b
     a.run.policy == b.run.policy && (a.file == b.file || identity(results, a) == identity(results, b))
 }
 
-/// What determines the actions of a policy, as far as its results file says so: its settings, and the hash of its weights.
-fn identity<'r>(results: &'r [(PathBuf, Results)], row: &Row<'_>) -> ([Option<&'r Value>; 3], Option<&'r String>) {
+/// What determines the actions of a policy, as far as its results file says so: its settings, those of the evaluation, and the hash of its
+/// weights.
+fn identity<'r>(results: &'r [(PathBuf, Results)], row: &Row<'_>) -> ([Option<&'r Value>; 4], Option<&'r String>) {
     let manifest = &results[row.file].1.manifest;
     let config = &manifest.config;
     let policies = config.get("policies").and_then(Value::as_array);
@@ -65,5 +66,6 @@ fn identity<'r>(results: &'r [(PathBuf, Results)], row: &Row<'_>) -> ([Option<&'
     let policy = policies.and_then(|policies| policies.iter().find(is_this));
     // A file of one policy does not name it beside the hash.
     let weights = manifest.hashes.get(&format!("weights of {}", row.run.policy));
-    ([policy, config.get("budget"), config.get("starts")], weights.or_else(|| manifest.hashes.get("weights")))
+    let settings = [policy, config.get("budget"), config.get("starts"), config.get("image")];
+    (settings, weights.or_else(|| manifest.hashes.get("weights")))
 }

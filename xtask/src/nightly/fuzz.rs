@@ -112,10 +112,11 @@ fn fuzz(program: &Path, name: &str, folder: &Path, seconds: u64) -> Result<Total
     Ok(Totals { minutes, inputs, findings: u64::from(found) })
 }
 
-/// A fuzzer with the limits of time and memory for one input.
+/// A fuzzer with the limits of time and memory for one input. It keeps all seeds: those that replace a file of a dataset by
+/// itself reach the same code, so that it would keep the smallest only.
 fn command(program: &Path) -> Command {
     let mut command = Command::new(program);
-    command.args(["-malloc_limit_mb=256", "-rss_limit_mb=4096", "-timeout=30", "-print_funcs=0"]);
+    command.args(["-malloc_limit_mb=256", "-rss_limit_mb=4096", "-timeout=30", "-print_funcs=0", "-keep_seed=1"]);
     command
 }
 

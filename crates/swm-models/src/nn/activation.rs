@@ -46,7 +46,7 @@ fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 }
 
 /// Whether the CPU kernels of `swm-kernels` apply to a tensor.
-pub(super) fn has_kernels<const D: usize>(x: &Tensor<D>) -> bool {
+pub(crate) fn has_kernels<const D: usize>(x: &Tensor<D>) -> bool {
     is_cpu(&x.device()) && x.dtype() == DType::F32
 }
 

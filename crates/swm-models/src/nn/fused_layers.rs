@@ -1,4 +1,4 @@
-//! Layers as single operations of an autodiff graph on the CPU: a [`linear`] layer with or without ReLU in place of up to five, and a
+//! Layers as single operations of an autodiff graph on the CPU: a [`linear`] layer in place of up to four, and a
 //! [`hidden`] layer (linear, dropout, layer normalisation, Mish) in place of some twenty. Burn would allocate, clear and copy memory for
 //! each.
 
@@ -12,13 +12,13 @@ use burn::tensor::{Tensor, TensorData};
 use std::sync::Arc;
 use swm_kernels::{Matrix, NormMish, NormMishTape, functions, multiply};
 
-/// Computes `x Wᵀ + b`, and ReLU of it if `is_relu`, on the CPU.
+/// Computes `x Wᵀ + b` on the CPU.
 ///
 /// # Shapes
 /// `x` is `[rows, inputs]`, `weight` `[outputs, inputs]`, `bias` `[outputs]`; returns `[rows, outputs]`.
-pub(super) fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, is_relu: bool) -> Tensor<2> {
+pub(super) fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>) -> Tensor<2> {
     let (x, weight, bias) = (x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch());
-    Tensor::from_dispatch(<Dispatch as Layers>::linear(x, weight, bias, is_relu))
+    Tensor::from_dispatch(<Dispatch as Layers>::linear(x, weight, bias))
 }
 
 /// The parameters of a hidden layer.
@@ -51,12 +51,7 @@ pub(super) fn hidden(x: Tensor<2>, parameters: HiddenParameters, mask: Vec<f32>)
 #[backend_extension(Flex, Autodiff)]
 trait Layers: Backend {
     /// See [`linear`].
-    fn linear(
-        x: FloatTensor<Self>,
-        weight: FloatTensor<Self>,
-        bias: FloatTensor<Self>,
-        is_relu: bool,
-    ) -> FloatTensor<Self>;
+    fn linear(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self>;
 
     /// See [`hidden`].
     fn hidden(
@@ -71,21 +66,12 @@ trait Layers: Backend {
 }
 
 impl Layers for Flex {
-    fn linear(
-        x: FloatTensor<Self>,
-        weight: FloatTensor<Self>,
-        bias: FloatTensor<Self>,
-        is_relu: bool,
-    ) -> FloatTensor<Self> {
+    fn linear(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
         let mut y = product(&x, &weight);
         let bias = bias.to_contiguous();
         let bias = elements(&bias);
         for row in y.chunks_exact_mut(bias.len()) {
             row.iter_mut().zip(bias).for_each(|(y, bias)| *y += bias);
-        }
-        if is_relu {
-            // NaN stays NaN.
-            y.iter_mut().for_each(|y| *y = if *y < 0.0 { 0.0 } else { *y });
         }
         rows(y, bias.len())
     }
@@ -107,19 +93,14 @@ impl Layers for Flex {
 }
 
 impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
-    fn linear(
-        x: FloatTensor<Self>,
-        weight: FloatTensor<Self>,
-        bias: FloatTensor<Self>,
-        is_relu: bool,
-    ) -> FloatTensor<Self> {
+    fn linear(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
         let ((x, of_x), (weight, of_weight), (bias, of_bias)) =
             (x.into_parts(), weight.into_parts(), bias.into_parts());
         let (x, weight) = (x.to_contiguous(), weight.to_contiguous());
-        let y = Flex::linear(x.clone(), weight.clone(), bias, is_relu);
+        let y = Flex::linear(x.clone(), weight.clone(), bias);
         match LinearGradient.prepare::<C>([of_x, of_weight, of_bias]).compute_bound().stateful() {
             OpsKind::UnTracked(prepared) => prepared.finish(y),
-            OpsKind::Tracked(prepared) => prepared.finish(([x, weight], is_relu.then(|| y.clone())), y),
+            OpsKind::Tracked(prepared) => prepared.finish([x, weight], y),
         }
     }
 
@@ -158,17 +139,12 @@ impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
 struct LinearGradient;
 
 impl Backward<Flex, 3> for LinearGradient {
-    /// Inputs and weights; the outputs, if ReLU follows.
-    type State = ([FloatTensor<Flex>; 2], Option<FloatTensor<Flex>>);
+    /// Inputs and weights.
+    type State = [FloatTensor<Flex>; 2];
 
     fn backward(self, ops: Ops<Self::State, 3>, gradients: &mut Gradients, _: &mut Checkpointer) {
-        let ([x, weight], y) = ops.state;
-        let mut d = values(gradients.consume::<Flex>(&ops.node));
-        if let Some(y) = y {
-            for (d, y) in d.iter_mut().zip(elements(&y)) {
-                *d = if *y > 0.0 { *d } else { 0.0 };
-            }
-        }
+        let [x, weight] = ops.state;
+        let d = values(gradients.consume::<Flex>(&ops.node));
         let [of_x, of_weight, of_bias] = ops.parents;
         if let Some(parent) = of_bias {
             let [features, _] = weight.shape().dims();
@@ -270,7 +246,7 @@ mod tests {
     use super::*;
     use crate::nn::norm::standardize;
     use crate::nn::parameters::host;
-    use burn::tensor::{Device, activation};
+    use burn::tensor::Device;
 
     fn tensor(seed: usize, shape: [usize; 2]) -> Tensor<2> {
         let value = |i: usize| ((i + seed) * 7919 % 1009) as f32 / 504.5 - 1.0;
@@ -298,18 +274,15 @@ mod tests {
     #[test]
     fn linear_layers_have_the_values_and_gradients_of_their_definition() {
         let (x, weight, bias) = (tensor(1, [9, 5]), tensor(2, [21, 5]), tensor(3, [1, 21]));
-        for is_relu in [false, true] {
-            let inputs = [&x, &weight, &bias];
-            let found = linear(x.clone(), weight.clone(), bias.clone().squeeze_dim(0), is_relu);
-            let found = derivatives(found, &inputs);
-            let y = x.clone().matmul(weight.clone().transpose()) + bias.clone();
-            assert_close(&found, &derivatives(if is_relu { activation::relu(y) } else { y }, &inputs));
-            assert_eq!(found[0].contains(&0.0), is_relu);
-            // The same outside a graph, and of a part of the rows.
-            let bias = bias.clone().inner().squeeze_dim(0);
-            let part = linear(x.clone().inner().narrow(0, 3, 2), weight.clone().inner(), bias, is_relu);
-            assert_eq!(host(part), found[0][3 * 21..5 * 21]);
-        }
+        let inputs = [&x, &weight, &bias];
+        let found = linear(x.clone(), weight.clone(), bias.clone().squeeze_dim(0));
+        let found = derivatives(found, &inputs);
+        let y = x.clone().matmul(weight.clone().transpose()) + bias.clone();
+        assert_close(&found, &derivatives(y, &inputs));
+        // The same outside a graph, and of a part of the rows.
+        let bias = bias.clone().inner().squeeze_dim(0);
+        let part = linear(x.clone().inner().narrow(0, 3, 2), weight.clone().inner(), bias);
+        assert_eq!(host(part), found[0][3 * 21..5 * 21]);
     }
 
     #[test]

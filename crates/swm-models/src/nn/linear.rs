@@ -6,7 +6,6 @@ use super::fused_layers;
 use crate::device::matmul;
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::activation::relu;
 
 /// A linear layer, `y = x Wᵀ + b`.
 #[derive(Module, Debug)]
@@ -65,19 +64,8 @@ impl Linear {
     /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward_fused(&self, x: Tensor<2>) -> Tensor<2> {
         match &self.bias {
-            Some(bias) if has_kernels(&x) => fused_layers::linear(x, self.weight.val(), bias.val(), false),
+            Some(bias) if has_kernels(&x) => fused_layers::linear(x, self.weight.val(), bias.val()),
             _ => self.forward(x),
-        }
-    }
-
-    /// Applies the layer and ReLU as one operation, on the CPU.
-    ///
-    /// # Shapes
-    /// Maps `[rows, inputs]` to `[rows, outputs]`.
-    pub fn forward_fused_relu(&self, x: Tensor<2>) -> Tensor<2> {
-        match &self.bias {
-            Some(bias) if has_kernels(&x) => fused_layers::linear(x, self.weight.val(), bias.val(), true),
-            _ => relu(self.forward(x)),
         }
     }
 }

@@ -1,8 +1,12 @@
 //! Access to the parameters of a module by their published names.
 
+use super::activation::has_kernels;
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{BackendTensor, DispatchTensorKind, Flex};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 use std::collections::BTreeMap;
+use std::ops::Deref;
 
 /// A tensor on the host.
 #[derive(Clone, Debug, PartialEq)]
@@ -143,9 +147,20 @@ pub fn blend<M: Module>(average: M, module: &M, keep: f64) -> M {
         value
     });
     map(average, |name, old| match values.remove(name) {
+        Some(new) if has_kernels(&old) => blend_on_host(old, &new, [keep as f32, (1.0 - keep) as f32]),
         Some(new) => old * keep + new * (1.0 - keep),
         None => old,
     })
+}
+
+/// Adds two tensors with weights, in one pass.
+fn blend_on_host(old: Tensor<1>, new: &Tensor<1>, weights: [f32; 2]) -> Tensor<1> {
+    let device = old.device();
+    let mut values = host(old);
+    let new = HostValues::of(new);
+    values.iter_mut().zip(&*new).for_each(|(old, new)| *old = *old * weights[0] + new * weights[1]);
+    let shape = [values.len()];
+    Tensor::from_data(TensorData::new(values, shape), &device)
 }
 
 /// Adds tensors to sums, by name.
@@ -184,6 +199,37 @@ pub fn trained_count<M: Module>(module: &M) -> usize {
 /// Copies the elements of a tensor to the host, row-major.
 pub(crate) fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().into_f32_vec()
+}
+
+/// The elements of a tensor, row-major: those that the CPU holds, or a copy of those of another device.
+pub(crate) enum HostValues {
+    /// A contiguous tensor.
+    Held(FloatTensor<Flex>),
+    /// A copy.
+    Copied(Vec<f32>),
+}
+
+impl HostValues {
+    /// Returns the elements of a tensor outside autodiff.
+    pub fn of<const D: usize>(tensor: &Tensor<D>) -> Self {
+        match tensor.clone().into_dispatch().kind {
+            DispatchTensorKind::Flex(BackendTensor::Float(held)) if held.as_slice::<f32>().is_some() => {
+                Self::Held(held)
+            }
+            _ => Self::Copied(host(tensor.clone())),
+        }
+    }
+}
+
+impl Deref for HostValues {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        match self {
+            Self::Held(held) => held.as_slice().unwrap_or_default(),
+            Self::Copied(values) => values,
+        }
+    }
 }
 
 /// Conversion of tensor data to single precision.

@@ -2,6 +2,7 @@
 //! bonus. `swm collect --policy CHECKPOINT` collects demonstrations with a trained policy. See `docs/models/sac.md`.
 
 mod config;
+mod cpu_losses;
 mod family;
 mod model;
 pub mod step;

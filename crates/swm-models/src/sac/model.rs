@@ -4,6 +4,7 @@ use super::config::{SacConfig, SacLoss};
 use crate::nn::{Init, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
+use burn::tensor::activation::relu;
 
 /// The networks of a SAC: a policy, two Q functions with target networks, and the temperature. A field `_i` of a
 /// network is element i of a `torch.nn.Sequential`.
@@ -108,7 +109,7 @@ impl Actor {
     /// # Shapes
     /// `observations` is `[rows, inputs]`; returns `[rows, action_dim]` twice.
     pub fn forward(&self, observations: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
-        let hidden = self.latent_pi._2.forward_fused_relu(self.latent_pi._0.forward_fused_relu(observations));
+        let hidden = relu(self.latent_pi._2.forward_fused(relu(self.latent_pi._0.forward_fused(observations))));
         (self.mu.forward_fused(hidden.clone()), self.log_std.forward_fused(hidden).clamp(-20.0, 2.0))
     }
 
@@ -139,6 +140,6 @@ impl Critics {
 
 impl Critic {
     fn forward(&self, x: Tensor<2>) -> Tensor<1> {
-        self._4.forward_fused(self._2.forward_fused_relu(self._0.forward_fused_relu(x))).squeeze_dim(1)
+        self._4.forward_fused(relu(self._2.forward_fused(relu(self._0.forward_fused(x))))).squeeze_dim(1)
     }
 }

@@ -3,9 +3,10 @@
 //! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This optimizer
 //! clips the whole gradient and keys its state by parameter name, so that the state can be stored with the weights.
 
-use crate::nn::parameters::{self, HostTensor, IntoF32, Named, host};
+use crate::nn::parameters::{self, HostTensor, HostValues, IntoF32, Named, host};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use swm_core::{Error, Result};
@@ -148,34 +149,43 @@ impl AdamW {
         let [beta1, beta2] = self.config.betas;
         let bias1 = 1.0 - beta1.powi(self.steps as i32);
         let root_bias2 = (1.0 - beta2.powi(self.steps as i32)).sqrt();
-        let moments = &mut self.moments;
-        let config = &self.config;
+        let mut updates = vec![];
+        // Collects the tensors without copying them.
         let module = parameters::map(module, |name, value| {
             let Some(gradient) = gradients.remove(name) else { return value };
             let group = group(name);
-            let lr = config.lr * lr_factor * group.lr;
+            let lr = self.config.lr * lr_factor * group.lr;
             // PyTorch adds 1e-6 to the norm, so that the divisor of a zero gradient is not 0.
-            let scale = config.clip / (squared_norms[&group.clip].sqrt() + 1e-6);
+            let scale = self.config.clip / (squared_norms[&group.clip].sqrt() + 1e-6);
             let step = AdamWStep {
                 gradient: scale.min(1.0) as f32,
                 betas: [beta1 as f32, beta2 as f32],
                 weights: [(1.0 - beta1) as f32, (1.0 - beta2) as f32],
                 root_bias: root_bias2 as f32,
-                epsilon: config.epsilon as f32,
-                keep: (1.0 - lr * config.weight_decay) as f32,
+                epsilon: self.config.epsilon as f32,
+                keep: (1.0 - lr * self.config.weight_decay) as f32,
                 rate: (lr / bias1) as f32,
             };
             let zeros = || Tensor::zeros_like(&gradient);
-            let old = moments.remove(name).unwrap_or_else(|| Moments { first: zeros(), second: zeros() });
-            let (value, new) = if value.device() == Device::flex() {
-                host_step(&step, value, gradient, old)
-            } else {
-                device_step(&step, value, gradient, old)
-            };
-            moments.insert(name.to_owned(), new);
+            let old = self.moments.remove(name).unwrap_or_else(|| Moments { first: zeros(), second: zeros() });
+            updates.push((name.to_owned(), step, value.clone(), gradient, old));
             value
         });
-        (module, norm)
+        let on_host = updates.first().is_none_or(|(_, _, value, ..)| value.device() == Device::flex());
+        // The threads meet once, not once for each parameter.
+        let updated: Vec<_> = if on_host {
+            let host = |(name, step, value, gradient, old)| (name, host_step(&step, value, gradient, old));
+            updates.into_par_iter().map(host).collect()
+        } else {
+            let device = |(name, step, value, gradient, old)| (name, device_step(&step, value, gradient, old));
+            updates.into_iter().map(device).collect()
+        };
+        let mut values = Named::new();
+        for (name, (value, new)) in updated {
+            self.moments.insert(name.clone(), new);
+            values.insert(name, value);
+        }
+        (parameters::map(module, |name, old| values.remove(name).unwrap_or(old)), norm)
     }
 }
 
@@ -205,7 +215,8 @@ fn device_step(step: &AdamWStep, value: Tensor<1>, gradient: Tensor<1>, old: Mom
 fn squared_norms(gradients: &Named<Tensor<1>>, group: fn(&str) -> ParameterGroup) -> (BTreeMap<usize, f64>, f64) {
     let on_host = gradients.values().next().is_none_or(|gradient| gradient.device() == Device::flex());
     let sums = if on_host {
-        gradients.values().map(|gradient| sum_of_squares(&host(gradient.clone()))).collect()
+        let gradients: Vec<&Tensor<1>> = gradients.values().collect();
+        gradients.into_par_iter().map(|gradient| sum_of_squares(&HostValues::of(gradient))).collect()
     } else {
         device_sums_of_squares(gradients)
     };

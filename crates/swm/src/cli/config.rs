@@ -78,7 +78,8 @@ impl CodecArgs {
 pub struct VariationArgs {
     /// Factors to sample at every reset: keys, groups, `all` or `none`
     ///
-    /// A group is the first part of a key, such as `agent` of `agent.color`.
+    /// A group is the first part of a key, such as `agent` of `agent.color`. These replace the factors that the environment samples by
+    /// itself, such as the start: name those as well (`swm fovs` marks them), or all episodes start alike.
     #[arg(long, value_name = "KEY", num_args = 1.., value_delimiter = ',')]
     pub variation: Option<Vec<String>>,
     /// Factors to set to a value, such as background.color=200,220,255

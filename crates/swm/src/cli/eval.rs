@@ -291,6 +291,18 @@ impl EvalArgs {
         Ok(())
     }
 
+    /// Checks the options without the policies, and without the conditions if the environment is not one of `swm-envs`.
+    ///
+    /// # Errors
+    /// As [`EvalArgs::check`].
+    pub(super) fn check_options(&self, resolver: &HomeResolver) -> Result<()> {
+        if self.env.as_ref().is_none_or(|env| swm_envs::ENVS.choose(env).is_ok()) {
+            return self.check(resolver, |_| true);
+        }
+        self.wrappers.choices(resolver.origin())?;
+        self.planner.check()
+    }
+
     fn starts(&self, resolver: &HomeResolver) -> Result<StartsRequest> {
         let Some(dataset) = &self.dataset else { return Ok(StartsRequest::Episodic) };
         let split = Split { seed: self.split_seed, ..Split::default() };

@@ -49,7 +49,9 @@ mod wrappers;
 mod zoo;
 
 use clap::{FromArgMatches as _, Parser, Subcommand};
+pub use lab::Pages;
 use output::{emit, emit_json, eprint, table};
+pub use recipes::check_text as check_recipe;
 pub use run_record::{check_training, record_training};
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::error::Error as _;

@@ -3,6 +3,7 @@
 use super::Entry;
 use super::entry::baseline;
 use serde_json::json;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use swm_core::results::Run;
 use swm_core::{Error, Result, VariationRequest};
@@ -88,21 +89,21 @@ fn add(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
 /// # Errors
 /// When an entry has no request.
 pub fn board(found: &[Found], title: &str) -> Result<Leaderboard> {
-    let mut tables: Vec<(String, BoardTable)> = vec![];
+    let mut tables: Vec<BoardTable> = vec![];
+    // The index of a table by what its entries have in common: there may be very many.
+    let mut known: BTreeMap<String, usize> = BTreeMap::new();
     let mut pages = vec![];
     for (index, Found { file, entry }) in found.iter().enumerate() {
         let request = entry.request()?;
         pages.push(page(file, entry)?);
         for condition in &request.conditions {
-            let key = key(entry, &request, condition);
-            let at = tables.iter().position(|(known, _)| *known == key).unwrap_or_else(|| {
-                tables.push((key, table(entry, &request, condition)));
+            let at = *known.entry(key(entry, &request, condition)).or_insert_with(|| {
+                tables.push(table(entry, &request, condition));
                 tables.len() - 1
             });
-            add_runs(&mut tables[at].1, index, entry, (&request, condition));
+            add_runs(&mut tables[at], index, entry, (&request, condition));
         }
     }
-    let mut tables: Vec<BoardTable> = tables.into_iter().map(|(_, table)| table).collect();
     // The tables of an environment stand together, in the order of their entries.
     tables.sort_by(|a, b| a.env.cmp(&b.env));
     for table in &mut tables {
@@ -236,5 +237,22 @@ mod tests {
         ] {
             assert_eq!(quoted(name), word);
         }
+    }
+
+    #[test]
+    fn very_many_conditions_have_tables_at_once() {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../leaderboard/two-room-lewm.json");
+        let mut entry = Entry::read(&file).expect("an entry");
+        entry.results.runs.clear();
+        let found = (0..300).map(|i| {
+            let mut entry = entry.clone();
+            let values = |j: usize| json!({"variation": null, "variation_values": {"agent.color": [i, j, 0]}});
+            let conditions: Vec<_> = (0..200).map(|j| json!({"name": "c", "variation": values(j)})).collect();
+            entry.results.manifest.config["conditions"] = conditions.into();
+            Found { file: file.clone(), entry }
+        });
+        let (found, start) = (Vec::from_iter(found), std::time::Instant::now());
+        assert_eq!(board(&found, "b").expect("tables").tables.len(), 60_000);
+        assert!(start.elapsed().as_secs() < 10, "{:?}", start.elapsed());
     }
 }

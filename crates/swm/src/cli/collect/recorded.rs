@@ -103,6 +103,10 @@ fn arguments(location: &Location, manifest: &Manifest) -> Result<Vec<String>> {
         let fix = "continue it in Python: World.collect with goal=True and mode='append'";
         return refused("it stores the frame of the goal, for which `swm collect` has no option".to_owned(), fix);
     }
+    if let Some(choice) = recorded.wrappers.iter().flatten().find(|choice| choice.id.starts_with("python:")) {
+        let problem = format!("it was collected with a wrapper or a setting of Python: {}", choice.id);
+        return refused(problem, "continue it in Python: World.collect with mode='resume'");
+    }
     Ok(recorded.into_arguments(manifest.seed))
 }
 

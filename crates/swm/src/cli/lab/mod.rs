@@ -12,7 +12,7 @@ use crate::{ENVS, home};
 use clap::Args;
 use planning::HomePlanning;
 use program::OwnProgram;
-use reports::Pages;
+pub use reports::Pages;
 use serde_json::json;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;

@@ -4,10 +4,12 @@ mod datasets;
 mod file;
 pub(super) mod lines;
 mod run;
+mod text_check;
 
 pub use datasets::Datasets;
 pub use file::is_preset_name;
 pub use run::{RecipeRun, pretrained_weights, run};
+pub use text_check::check_text;
 
 use super::{emit, emit_json, table};
 use clap::Args;

@@ -166,16 +166,28 @@ fn combinations(file: &StudyFile, settings: &[String], resolver: &HomeResolver) 
     Ok(combinations)
 }
 
-/// The request of a cell, with the names of the study.
-fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver) -> Result<EvalRequest> {
+/// Returns the options of the first cells, at most `most`.
+///
+/// # Errors
+/// When a table or an option is invalid.
+pub fn options(file: &StudyFile, most: usize, resolver: &HomeResolver) -> Result<Vec<EvalArgs>> {
+    combinations(file, &[], resolver)?.iter().take(most).map(|combination| parsed(&combination.all)).collect()
+}
+
+/// The options of a cell.
+fn parsed(all: &Variant) -> Result<EvalArgs> {
     let matches = EvalArgs::augment_args(Command::new("swm eval")).try_get_matches_from(all.arguments());
     let parsed = matches.and_then(|matches| EvalArgs::from_arg_matches(&matches));
-    let args = parsed.map_err(|error| {
+    parsed.map_err(|error| {
         let text = usage::plain(&error);
         let line = text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned();
         Error::config("the options of a cell", line, "`swm eval --help` describes the options")
-    })?;
-    let mut request = args.request(resolver, CapsuleStarts::Ignore)?;
+    })
+}
+
+/// The request of a cell, with the names of the study.
+fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver) -> Result<EvalRequest> {
+    let mut request = parsed(all)?.request(resolver, CapsuleStarts::Ignore)?;
     let [only] = &mut request.policies[..] else {
         let problem = format!("its options make {} policies, and a cell has one", request.policies.len());
         return Err(Error::config("the policy", problem, "give one policy and one solver; `each` makes several cells"));

@@ -2,7 +2,7 @@
 
 use super::csv;
 use clap::ValueEnum;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use swm_core::results::{BreakingPoint, ImageRank, OverSeeds, StudyResults, StudyRow, Verdict};
 use swm_core::text::printable;
 use swm_core::{Error, Result};
@@ -69,6 +69,24 @@ struct Pivot<'a> {
     cells: BTreeMap<(usize, usize), &'a StudyRow>,
 }
 
+/// The condition of every row, with the values of the variables in which rows differ that are equal otherwise, such as those of a list
+/// of budgets.
+pub(super) fn conditions(results: &StudyResults) -> Vec<String> {
+    let mut first = BTreeMap::new();
+    let mut several = BTreeSet::new();
+    for row in &results.rows {
+        let key = (&row.starts, row.counting.name(), row.seed, &row.condition, &row.policy);
+        let other = *first.entry(key).or_insert(row);
+        let variables = row.variables.keys().chain(other.variables.keys());
+        several.extend(variables.filter(|variable| row.variables.get(*variable) != other.variables.get(*variable)));
+    }
+    let name = |row: &StudyRow| {
+        let values = several.iter().filter_map(|variable| Some((variable, row.variables.get(*variable)?)));
+        values.fold(row.condition.clone(), |name, (variable, value)| format!("{name}, {variable} {value}"))
+    };
+    results.rows.iter().map(name).collect()
+}
+
 /// The names of all rows: the condition, and what else differs between the cells of the study.
 fn names(results: &StudyResults) -> Vec<String> {
     let rows = &results.rows;
@@ -79,8 +97,7 @@ fn names(results: &StudyResults) -> Vec<String> {
     let by_starts = differs(|row| row.starts.clone());
     let by_counting = differs(|row| row.counting.name().to_owned());
     let by_seed = differs(|row| row.seed.to_string());
-    let name = |row: &StudyRow| {
-        let mut name = row.condition.clone();
+    let name = |(row, mut name): (&StudyRow, String)| {
         if by_starts {
             name += &format!(" ({})", row.starts);
         }
@@ -92,7 +109,7 @@ fn names(results: &StudyResults) -> Vec<String> {
         }
         name
     };
-    rows.iter().map(name).collect()
+    rows.iter().zip(conditions(results)).map(name).collect()
 }
 
 impl<'a> Pivot<'a> {
@@ -317,6 +334,27 @@ mod tests {
         let over_seeds = OverSeeds::all(&rows, "plain");
         let [title, question, hash] = ["t", "q?", "h"].map(str::to_owned);
         StudyResults { title, question, hash, cells: 4, done: 3, rows, families, over_seeds, ..StudyResults::default() }
+    }
+
+    #[test]
+    fn cells_that_differ_in_a_variable_have_rows_of_their_own() {
+        let mut results = results();
+        for row in &mut results.rows {
+            row.variables.insert("budget".to_owned(), "20".to_owned());
+        }
+        let plain = Format::Markdown.write(&results);
+        assert!(!plain.contains("budget"), "{plain}");
+        let mut again = results.rows[0].clone();
+        again.variables.insert("budget".to_owned(), "40".to_owned());
+        again.success = Proportion::wilson(3, 10);
+        results.rows.push(again);
+        for format in [Format::Latex, Format::Markdown] {
+            let table = format.write(&results);
+            for expected in ["plain, budget 20", "plain, budget 40", "30.0 [", "90.0 ["] {
+                assert!(table.contains(expected), "{table}");
+            }
+            assert!(!table.contains("count 2"), "{table}");
+        }
     }
 
     #[test]

@@ -4,6 +4,7 @@ use super::any_file::Size;
 use super::published;
 use crate::cli::eval::EvalArgs;
 use crate::cli::recipes::Datasets;
+use crate::cli::recipes::lines::LineFeeds;
 use clap::{ArgAction, Args as _, Command};
 use serde::Deserialize as _;
 use std::collections::BTreeMap;
@@ -196,19 +197,19 @@ pub(super) struct Source<'a> {
     text: &'a str,
     /// The path; `None` for a setting of the command line.
     path: Option<&'a Path>,
+    feeds: LineFeeds,
     command: Command,
 }
 
 impl Source<'_> {
     fn new<'a>(text: &'a str, path: Option<&'a Path>) -> Source<'a> {
-        Source { text, path, command: EvalArgs::augment_args(Command::new("eval")) }
+        Source { text, path, feeds: LineFeeds::of(text), command: EvalArgs::augment_args(Command::new("eval")) }
     }
 
     /// The file and line of a byte, or the setting.
     pub(super) fn at(&self, byte: usize) -> String {
         let Some(path) = self.path else { return self.text.to_owned() };
-        let line = 1 + self.text.as_bytes().iter().take(byte).filter(|byte| **byte == b'\n').count();
-        format!("{}:{line}", path.display())
+        format!("{}:{}", path.display(), self.feeds.line(byte))
     }
 
     pub(super) fn invalid(&self, value: &Spanned<DeValue<'_>>, problem: &str, fix: &str) -> Error {

@@ -17,6 +17,7 @@ mod resume;
 mod shipped;
 mod table_kind;
 mod tables;
+mod text_check;
 mod variants;
 
 use super::config::count;
@@ -34,7 +35,7 @@ use clap::{Args, Subcommand, ValueEnum as _};
 pub(super) use expand::shell;
 use export::Format;
 pub use export::escape_markdown;
-pub(super) use report::write_page;
+pub use report::write_page;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -42,6 +43,7 @@ use swm_core::results::{BreakingPoint, StudyResults, Until};
 use swm_core::run::Control;
 use swm_core::{Error, Origin, Result, limits};
 use swm_eval::{AnyStudy, Cell, Common, Study, StudyFolder};
+pub use text_check::check_text;
 
 /// Arguments of `swm study`.
 #[derive(Args)]
@@ -402,17 +404,11 @@ fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
     let shown: Vec<_> = optional.into_iter().filter(|(_, of)| several(*of)).collect();
     let mut header: Vec<&str> = shown.iter().map(|(name, _)| *name).collect();
     header.extend(["condition", "policy", "success [95 %]", "n", "floor", "gap [95 %]", "p, corrected", "verdict"]);
-    let rows = results.rows.iter().map(|row| {
+    let rows = results.rows.iter().zip(export::conditions(results)).map(|(row, condition)| {
         let mut cells: Vec<String> = shown.iter().map(|(_, of)| of(row)).collect();
         let gap = row.gap.as_ref().map_or(["–"; 3].map(str::to_owned), compared);
         let floor = format!("{:.0} %", 100.0 * row.floor.rate);
-        cells.extend([
-            row.condition.clone(),
-            row.policy.clone(),
-            percent(&row.success),
-            row.success.n.to_string(),
-            floor,
-        ]);
+        cells.extend([condition, row.policy.clone(), percent(&row.success), row.success.n.to_string(), floor]);
         cells.extend(gap);
         cells
     });

@@ -24,15 +24,15 @@ def open_world(
     nearest: bool | None,
     threads: int,
     wrap_goal: bool,
-) -> tuple[Any, list[Any], list[Any]]:
+) -> tuple[Any, list[Any], list[Any], str | None]:
     """Creates a world of Gymnasium environments.
 
     If all wrappers are visual wrappers of this package, they run in the engine. Otherwise all wrappers run in Python.
     `nearest` is the interpolation that resizes frames: see `is_nearest`.
 
     Returns:
-        The engine's world, the list of its Gymnasium environments (the world appends each one that it creates), and the
-        ids and settings of the wrappers that run in the engine.
+        The engine's world, the list of its Gymnasium environments (the world appends each one that it creates), the ids and
+        settings of the wrappers that run in the engine, and the interpolation if it is not that of the environment.
     """
     in_engine = engine_wrappers(wrappers)
     in_python = [] if in_engine is not None else list(wrappers)
@@ -42,6 +42,7 @@ def open_world(
     except ModuleNotFoundError as error:
         raise _missing("craftax", error) from error
     envs: list[Any] = []
+    resampled: set[str] = set()
     # Native environments render at any size, so their frames need no resizing.
     sized = {"image_shape": image} if image is not None and env_name in _engine.envs() else {}
 
@@ -53,6 +54,8 @@ def open_world(
         if max_episode_steps is not None:
             made.max_episode_steps = max_episode_steps
         if nearest is not None:
+            if image is not None and not sized and nearest != bool(getattr(made.env.unwrapped, "swm_pixel_art", False)):
+                resampled.add("nearest" if nearest else "bilinear")
             made.env.unwrapped.swm_pixel_art = nearest
         envs.append(made.env)
         if wrap_goal and in_python and any(isinstance(layer, VisualWrapper) for layer in _layers(made.env)):
@@ -67,7 +70,7 @@ def open_world(
     world = _engine.World.gymnasium(
         described, make, num_envs, image, max_episode_steps, threads, json.dumps(in_engine or []), wrap_goal
     )
-    return world, envs, in_engine or []
+    return world, envs, in_engine or [], next(iter(resampled), None)
 
 
 def _layers(env: Any) -> Iterator[Any]:

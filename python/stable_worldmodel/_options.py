@@ -62,7 +62,7 @@ def indices(name: str, given: Any, count: int) -> list[int]:
 
     Raises:
         TypeError: When the values are neither.
-        ValueError: When a mask has another length.
+        ValueError: When a mask has another length, or an index is negative.
     """
     array = np.asarray(given)
     if array.dtype == bool:
@@ -74,6 +74,8 @@ def indices(name: str, given: Any, count: int) -> list[int]:
         return []
     if array.ndim != 1 or array.dtype.kind not in "iu":
         raise TypeError(f"{name}: expected indices or a mask of booleans, got {given!r}")
+    if array.min() < 0:
+        raise ValueError(f"{name}: {array.min()}; expected indices from 0 to {count - 1}")
     return [int(index) for index in array]
 
 
@@ -145,6 +147,40 @@ def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, A
     return json.dumps({"variation": variation(options, spaces), **given})
 
 
+def setting(value: Any, name: str = "a setting") -> str:
+    """The value of a setting as the command line reads it: TOML, in which a text on its own is bare.
+
+    Raises:
+        TypeError: When the value is `None` or contains it, because TOML has no such value; `name` says where.
+    """
+    return value if isinstance(value, str) else _toml(value, name)
+
+
+def _toml(value: Any, name: str) -> str:
+    if isinstance(value, np.ndarray):
+        value = list(value) if value.ndim else value[()]
+    if isinstance(value, np.floating):
+        # The shortest text for its type: float32 of 0.0003 is 0.0003000000142492354 as a float of Python.
+        return str(value)
+    # Other scalars of numpy, and tensors.
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if value is None:
+        raise TypeError(f"{name}: None; expected a value; leave the setting out for its default")
+    if isinstance(value, bool):
+        return json.dumps(value)
+    if isinstance(value, Mapping):
+        items = ((_quoted(str(key)), _toml(item, f"{name}.{key}")) for key, item in value.items())
+        return "{" + ", ".join(f"{key} = {text}" for key, text in items) + "}"
+    if isinstance(value, (list, tuple, range)):
+        return "[" + ", ".join(_toml(item, name) for item in value) + "]"
+    return _quoted(value) if isinstance(value, str) else str(value)
+
+
+def _quoted(text: str) -> str:
+    # JSON writes characters such as emoji as two surrogates otherwise, which TOML does not have.
+    return json.dumps(text, ensure_ascii=False)
+
+
 def callables(given: Any) -> list[dict[str, Any]]:
     """The `callables` of `World.evaluate`, checked and converted to values that JSON can hold."""
     calls = []
@@ -197,10 +233,15 @@ def _numbers(name: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     return values
 
 
+def are_fractions(colour: Any) -> bool:
+    """Whether the values of a colour are fractions of 255: floats that are all from 0 to 1."""
+    values = np.asarray(colour)
+    return values.dtype.kind == "f" and bool(np.all((values >= 0) & (values <= 1)))
+
+
 def _floats(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:
     values = _numbers(f"options['variation_values'][{key!r}]", value)
-    fractions = np.asarray(value).dtype.kind == "f" and np.all((values >= 0) & (values <= 1))
-    if space is not None and space["type"] == "RGBBox" and fractions:
+    if space is not None and space["type"] == "RGBBox" and are_fractions(value):
         values = np.round(255 * values)
     found: list[float] = values.tolist()
     return found

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from . import _engine
+from . import _engine, _files
 
 __all__ = ["checkpoints", "convert", "datasets", "envs", "fovs", "inspect", "main", "merge", "preview"]
 
@@ -103,6 +103,7 @@ def preview(
     from . import data
     from .utils import record_video_from_dataset
 
+    folder = _files.local("output", f"{os.path.splitext(os.path.basename(name))[0]}_preview" if output is None else output)
     dataset = data.load_dataset(name)
     images = [column for column, (_, shape) in dataset.schema.items() if len(shape) == 3 and shape[-1] in (1, 3)]
     if key is None and not images:
@@ -110,7 +111,6 @@ def preview(
     if episodes is None:
         chosen = np.random.default_rng(seed).permutation(dataset.num_episodes)[:num]
         episodes = sorted(int(episode) for episode in chosen)
-    folder = f"{os.path.splitext(os.path.basename(name))[0]}_preview" if output is None else output
     record_video_from_dataset(folder, dataset, episodes, max_steps=10**9, fps=fps, viewname=key or images[0])
     print(folder)
 

@@ -96,7 +96,8 @@ def _seconds(name: str, value: Any) -> float:
 class BasePolicy:
     """Base class of policies."""
 
-    #: The kind of the policy, for manifests and results; the name of the class for `"base"`.
+    #: The kind of the policy, for manifests and results; the name of the class for `"base"`, and for the name of a policy of
+    #: the engine, such as `"random"`.
     type = "base"
 
     def __init__(self, **kwargs: Any) -> None:
@@ -612,17 +613,21 @@ _PROBES = np.array([-7.3, -2.1, -1.0, -0.4, 0.0, 0.3, 0.9, 1.7, 5.2], np.float32
 
 
 def AutoCostModel(run_name: str, cache_dir: Any = None) -> Any:
-    """Loads a checkpoint to plan with, by name or path: as `swm.wm.load`, or a torch module that `save_pretrained` saved."""
+    """Loads a checkpoint to plan with, by name or path: as `swm.wm.load`, or a torch module that `save_pretrained` saved.
+
+    A path that holds a checkpoint counts before a name under `$STABLEWM_HOME/checkpoints`, and a name under `cache_dir` before
+    a path, as in `swm.wm.load_pretrained`.
+    """
     from pathlib import Path
 
     from . import wm
+    from .wm._located import is_module, located
 
-    name = str(run_name) if cache_dir is None else str(Path(cache_dir) / run_name)
-    home = Path(_engine.home() if cache_dir is None else cache_dir)
-    for folder in (home / "checkpoints" / run_name, Path(name)):
-        if (folder / "config.json").is_file() and any(folder.glob("*.pt")):
-            return wm.utils.load_pretrained(folder.resolve()).eval()
-    return wm.load(name)
+    path = located(str(run_name), cache_dir)
+    if path is not None and is_module(path):
+        return wm.utils.load_pretrained(path.resolve()).eval()
+    # What is not found is a capsule of the zoo, or a URI, or an error.
+    return wm.load(str(path or (run_name if cache_dir is None else Path(cache_dir) / run_name)))
 
 
 def AutoActionableModel(run_name: str, cache_dir: Any = None) -> Any:

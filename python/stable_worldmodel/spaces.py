@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from . import _options
+
 __all__ = ["Box", "Dict", "Discrete", "MultiDiscrete", "RGBBox", "reset_variation_space"]
 
 
@@ -381,7 +383,8 @@ def reset_variation_space(
     """Resets the factors of an environment for an episode.
 
     Sets all factors to their defaults, samples the factors in `options["variation"]` (`default_variations` if it is
-    missing), and sets the factors in `options["variation_values"]`.
+    missing), and sets the factors in `options["variation_values"]`: a colour (`RGBBox`) of floats that are all from 0 to 1 has
+    fractions of 255, as in `World.reset`.
     """
     options = options or {}
     variation_space.seed(seed)
@@ -389,7 +392,11 @@ def reset_variation_space(
     names = options.get("variation")
     names = default_variations or () if names is None else names
     variation_space.update([names] if isinstance(names, str) else names)
-    variation_space.set_value(options.get("variation_values") or {})
+    values = dict(variation_space._flat(options.get("variation_values") or {}))
+    for key, value in values.items():
+        if isinstance(variation_space.find(key), RGBBox) and _options.are_fractions(value):
+            values[key] = np.round(255 * np.asarray(value))
+    variation_space.set_value(values)
     if not variation_space.check():
         raise OutsideError(f"some factors are outside their spaces or violate a constrain_fn: {variation_space.value}")
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _engine
+from . import _engine, _files, _options
 from .wm.engine import _command
 
 __all__ = ["Study", "available", "read", "run"]
@@ -96,8 +96,12 @@ class Study:
         return _engine.study_export(str(self.folder), format)
 
     def report(self, output: str | os.PathLike[str] | None = None) -> Path:
-        """Writes one HTML page with figures and tables beside it, and returns its path."""
-        folder = self.folder / "report" if output is None else Path(output)
+        """Writes one HTML page with figures and tables beside it, and returns its path.
+
+        Raises:
+            ValueError: If the folder is a URI.
+        """
+        folder = self.folder / "report" if output is None else _files.local("output", output)
         _command(["swm", "study", "report", str(self.folder), "--output", str(folder)])
         return folder / "index.html"
 
@@ -109,7 +113,8 @@ def available() -> list[dict[str, str]]:
 
 def read(folder: str | os.PathLike[str]) -> Study:
     """Reads the results of a study from its folder."""
-    return Study(Path(folder), json.loads(_engine.study_results(os.fspath(folder))))
+    path = Path(folder).expanduser()
+    return Study(path, json.loads(_engine.study_results(str(path))))
 
 
 def run(
@@ -134,17 +139,13 @@ def run(
     Returns:
         The results.
     """
-    arguments = ["swm", "study", "run", os.fspath(study), "--output", os.fspath(output)]
+    output = _files.local("output", output)
+    arguments = ["swm", "study", "run", os.fspath(study), "--output", str(output)]
     arguments += [flag for flag, is_set in (("--small", small), ("--trust", trust)) if is_set]
     arguments += [] if until is None else ["--until", until]
-    arguments += [f"{name.replace('_', '-')}={_toml(value)}" for name, value in settings.items()]
+    arguments += [f"{name.replace('_', '-')}={_options.setting(value, name)}" for name, value in settings.items()]
     _command(arguments)
     return read(output)
-
-
-def _toml(value: Any) -> str:
-    """A setting as the command line reads it: lists and booleans are JSON, which is TOML; texts are bare."""
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

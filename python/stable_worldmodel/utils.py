@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import _engine
+from . import _engine, _files
 
 __all__ = [
     "DEFAULT_CACHE_DIR",
@@ -110,12 +110,16 @@ def record_video_from_dataset(
         max_steps: The largest number of frames.
         fps: Frames per second.
         viewname: The column of images, or several columns, which a frame shows beside each other.
+
+    Raises:
+        ValueError: If the folder is a URI, or the dataset does not have a column.
     """
     import numpy as np
 
     from .data._tensors import to_numpy
     from .plot import save_video
 
+    folder = _files.local("video_path", video_path)
     views = [viewname] if isinstance(viewname, str) else list(viewname)
     missing = [view for view in views if view not in dataset.column_names]
     if missing:
@@ -124,4 +128,4 @@ def record_video_from_dataset(
         columns = dataset.load_episode(episode)
         parts = [np.moveaxis(to_numpy(columns[view])[:max_steps], 1, -1) for view in views]
         frames = list(np.concatenate(parts, axis=2))
-        save_video(Path(video_path) / f"episode_{episode}.mp4", frames, fps)
+        save_video(folder / f"episode_{episode}.mp4", frames, fps)

@@ -50,6 +50,33 @@ def test_datasets_are_converted_merged_and_shown(tmp_path, monkeypatch, capfd):
     assert "a_preview" in capfd.readouterr().out
 
 
+def test_outputs_are_on_this_machine(tmp_path, monkeypatch):
+    one = written(tmp_path / "a.lance", 10)
+    work, user = tmp_path / "work", tmp_path / "user"
+    for folder in (work, user):
+        folder.mkdir()
+    monkeypatch.chdir(work)
+    monkeypatch.setenv("HOME", str(user))
+    frames, dataset = np.zeros((2, 16, 16, 3), np.uint8), swm.data.load_dataset(one)
+    study = swm.studies.run("paper/factors-per-env", "~/study")
+    assert study.folder == user / "study" and swm.studies.read("~/study").is_done
+    outputs = {
+        "v.mp4": lambda path: swm.plot.save_video(path, frames),
+        "panels": lambda path: swm.plot.save_panel_videos(path, {"a": [frames]}),
+        "record": lambda path: swm.utils.record_video_from_dataset(path, dataset, 0),
+        "preview": lambda path: cli.preview(one, num=1, output=path),
+        "report": study.report,
+        "cache": swm.data.get_cache_dir,
+    }
+    for name, write in outputs.items():
+        for scheme in ("s3", "http"):
+            with pytest.raises(ValueError, match=f"'{scheme}://bucket/{name}' is a URI; expected a path of this machine"):
+                write(f"{scheme}://bucket/{name}")
+        write(f"~/{name}")
+        assert (user / name).exists()
+    assert not list(work.iterdir())
+
+
 def command(monkeypatch, *arguments):
     """Runs the command line, and returns its exit code."""
     from stable_worldmodel.__main__ import main

@@ -1,6 +1,7 @@
 """Tests of reading: clips, chunks, columns and rows equal the written episodes."""
 
 import pickle
+import re
 import subprocess
 import sys
 
@@ -239,6 +240,9 @@ def test_goal_probabilities_choose_current_later_and_random_steps(tmp_path):
     assert goals.clip_indices[0] == (0, 0)
     with pytest.raises(ValueError, match="add up to 1"):
         data.GoalDataset(dataset, (1, 1, 0, 0))
+    third = 0.333333
+    goals, _ = drawn((third, third, third, 0))
+    assert sum(goals.goal_probabilities) == pytest.approx(1, abs=1e-12)
 
 
 def test_masks_and_fractions_are_no_indices(tmp_path):
@@ -259,6 +263,55 @@ def test_masks_and_fractions_are_no_indices(tmp_path):
         assert dataset.get_row_data(np.flatnonzero([True, False, True]))["reward"].ravel().tolist() == [0, 2]
     with pytest.raises(TypeError, match="sampler: expected whole numbers, got bool"):
         buffer.sample(3)
+
+
+class Counted(data.Dataset):
+    """A user's dataset of one episode of 12 rows."""
+
+    def __init__(self, **kwargs):
+        super().__init__([12], [0], **kwargs)
+
+    @property
+    def column_names(self):
+        return ["row", "action"]
+
+    def _load_slice(self, ep_idx, start, end):
+        return {"row": np.arange(start, end, self.frameskip), "action": np.arange(2 * start, 2 * end).reshape(-1, 2)}
+
+
+def test_chunks_of_buffers_and_of_users_datasets_are_checked_as_those_of_stored_ones():
+    buffer = data.ReplayBuffer(50, history_len=2, frameskip=2)
+    buffer.write_episode({"row": np.arange(12), "action": np.arange(24).reshape(12, 2)})
+    for dataset in (Counted(frameskip=2, num_steps=2), buffer):
+        for index in (0, -1):
+            (chunk,) = dataset.load_chunk([index], [2], [6])
+            assert np.asarray(chunk["action"]).tolist() == [[4, 5, 6, 7], [8, 9, 10, 11]]
+        for wrong, error, words in (
+            ((0, 0, 5), ValueError, "no multiples of frameskip 2"),
+            ((0, 10, 14), IndexError, "rows 10 .. 14 are outside episode 0, which has 12 rows"),
+            ((0, -4, 4), IndexError, "rows -4 .. 4 are outside"),
+            ((0, 6, 2), IndexError, "rows 6 .. 2 are outside"),
+            ((5, 0, 4), IndexError, "episode 5 is outside the dataset, which has 1 episodes"),
+            ((-13, 0, 4), IndexError, "episode -13 is outside the dataset, which has 1 episodes"),
+        ):
+            with pytest.raises(error, match=words):
+                dataset.load_chunk(*([value] for value in wrong))
+
+
+def test_chunks_are_given_as_sequences_of_one_length(tmp_path):
+    with data.EpisodeWriter(tmp_path / "a.h5") as writer:
+        writer.write_episode({"x": np.arange(12)})
+    stored = data.load_dataset(str(tmp_path / "a.h5"))
+    merged = data.MergeDataset([stored, Counted()], keys_from_dataset=[["x"], ["row"]])
+    for dataset in (stored, Counted(), merged, data.ConcatDataset([stored, stored])):
+        for wrong, shapes in ((([0, 0], [0], [2]), "(2,), (1,) and (1,)"), (([0], [0, 1], [2, 3]), "(1,), (2,) and (2,)")):
+            with pytest.raises(ValueError, match="sequences of one length.*" + re.escape(shapes)):
+                dataset.load_chunk(*wrong)
+        with pytest.raises(ValueError, match="sequences of one length"):
+            dataset.load_chunk(0, 0, 2)
+        with pytest.raises(IndexError, match="-13"):
+            dataset.load_chunk([-13], [0], [2])
+        assert dataset.load_chunk([], [], []) == []
 
 
 @pytest.mark.parametrize("kind", [data.MergeDataset, data.ConcatDataset])

@@ -232,6 +232,8 @@ def test_wrong_arguments_raise_errors_with_the_reason(stored, tmp_path):
         loader(path, batch_size=0)
     with pytest.raises(ValueError, match="no negative numbers, got {'threads': -1}"):
         loader(path, threads=-1)
+    with pytest.raises(ValueError, match="episodes: -1; expected indices from 0 to 3"):
+        loader(path, episodes=[0, -1])
     for name in ("batch_size", "num_steps", "frameskip", "rank", "world_size", "threads", "prefetch", "seed"):
         for wrong in (1.5, b"3", True, None if name == "batch_size" else "2"):
             with pytest.raises(ValueError, match=f"{name}: .*; expected a whole number"):

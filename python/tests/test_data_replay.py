@@ -73,6 +73,20 @@ def test_buffer_filters_columns_loads_and_dumps(tmp_path):
     np.testing.assert_array_equal(dataset.get_col_data("pixels"), buffer.get_col_data("pixels"))
 
 
+def test_a_dump_replaces_a_dataset_appends_to_it_or_refuses_it(tmp_path):
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episodes(episodes((5, 6)))
+    for mode, expected in (("overwrite", [5, 6]), ("overwrite", [5, 6]), ("append", [5, 6, 5, 6])):
+        buffer.dump(tmp_path / "a.lance", mode=mode)
+        assert data.load_dataset(tmp_path / "a.lance").lengths.tolist() == expected
+    with pytest.raises(FileExistsError, match="there is a dataset already"):
+        buffer.dump(tmp_path / "a.lance", mode="error")
+    data.ReplayBuffer(100).dump(tmp_path / "a.lance")
+    assert data.load_dataset(tmp_path / "a.lance").num_episodes == 4
+    buffer.dump(tmp_path / "a.lance")
+    assert data.load_dataset(tmp_path / "a.lance").lengths.tolist() == [5, 6]
+
+
 def test_an_action_in_the_last_row_is_kept():
     buffer = data.ReplayBuffer(max_steps=20, history_len=2)
     steps = {"state": np.arange(4.0)[:, None], "action": np.arange(4, dtype=np.float32)[:, None]}

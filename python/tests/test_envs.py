@@ -155,6 +155,31 @@ def test_wrong_actions_raise_errors_with_the_reason():
         cart.step(7)
 
 
+def test_actions_that_a_conversion_would_change_are_refused():
+    cart, rooms = swm.envs.NativeEnv("swm/CartPoleControl-v1"), swm.envs.NativeEnv("swm/TwoRoom-v1")
+    for env in (cart, rooms):
+        env.reset(seed=0)
+    for action in (1.7, np.array([0.5]), np.nan, np.inf, np.array([0.5], object)):
+        with pytest.raises(ValueError, match="step: expected whole numbers"):
+            cart.step(action)
+    for env, action in ((cart, "1"), (cart, [b"1"]), (cart, 1 + 0j), (rooms, ["0.5", "0"]), (rooms, [0.5 + 1j, 0])):
+        with pytest.raises(ValueError, match="step: expected real actions"):
+            env.step(action)
+    for env, action in ((rooms, np.array(["0.5", 0], object)), (rooms, [None, 0.5]), (rooms, None), (cart, None)):
+        with pytest.raises(ValueError, match="step: expected real actions"):
+            env.step(action)
+    # Whole numbers in another type, and other real numbers, are the same actions.
+    for env, one, others in (
+        (cart, 1, (1.0, np.array([1.0], np.float32), np.uint8(1), np.array([1], object))),
+        (rooms, [0.5, 0.0], (np.array([0.5, 0]), np.array([0.5, 0], object))),
+    ):
+        env.reset(seed=0)
+        expected = env.step(one)[4]["state"].tolist()
+        for other in others:
+            env.reset(seed=0)
+            assert env.step(other)[4]["state"].tolist() == expected
+
+
 IMPORTS = [
     "import gymnasium; import stable_worldmodel",
     "import stable_worldmodel; import gymnasium",

@@ -48,6 +48,23 @@ def test_all_factors_of_a_group_are_sampled_and_values_pinned():
     assert space.check() and isinstance(space, gymnasium.spaces.Dict)
 
 
+def test_colours_of_floats_up_to_one_are_fractions():
+    color = swm_spaces.RGBBox(init_value=np.array([9, 9, 9], np.uint8))
+    space = swm_spaces.Dict({"agent": swm_spaces.Dict({"color": color})})
+    for given, expected in (
+        ([1.0, 0.0, 0.5], [255, 0, 128]),
+        (np.array([0, 0, 1], np.float32), [0, 0, 255]),
+        ([1, 0, 0], [1, 0, 0]),
+        ([255.0, 0.0, 1.0], [255, 0, 1]),
+        (np.array([1, 0, 0], np.uint8), [1, 0, 0]),
+    ):
+        for values in ({"agent.color": given}, {"agent": {"color": given}}):
+            swm_spaces.reset_variation_space(space, 0, {"variation_values": values})
+            assert color.value.tolist() == expected and color.value.dtype == np.uint8
+    with pytest.raises(ValueError, match="is not in"):
+        swm_spaces.reset_variation_space(space, 0, {"variation_values": {"agent.color": [1.5, 0.0, 0.0]}})
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

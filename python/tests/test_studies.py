@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import stable_worldmodel as swm
-from stable_worldmodel import _engine
+from stable_worldmodel import _engine, _options
 
 STUDY = """
 title = "Colours"
@@ -68,6 +68,34 @@ def test_a_study_of_another_kind_has_its_own_columns(tmp_path):
     factors = json.loads(_engine.spec("swm/TwoRoom-v1"))["variation"]
     assert native[ids.index("swm/TwoRoom-v1")] == len(factors)
     assert study.export("markdown").startswith("| environment | native, factors |")
+
+
+def test_settings_of_numpy_are_those_of_python(tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY)
+    study = swm.studies.run(tmp_path / "study.toml", tmp_path / "out", episodes=np.int64(2), seed=np.array([0, 1]))
+    assert len(study.rows) == 6 and study.column("success.n").max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        (["😀", "a"], '["😀", "a"]'),
+        ({"é": {"b": 'say "x"'}}, '{"é" = {"b" = "say \\"x\\""}}'),
+        (np.float32(3e-4), "0.0003"),
+        ([np.array(3e-4, np.float32), np.float64(0.1)], "[0.0003, 0.1]"),
+        (np.array([[0.9, 0.95], [1, 2]], np.float32), "[[0.9, 0.95], [1.0, 2.0]]"),
+        (np.array([True, False]), "[true, false]"),
+        (np.array(["é"]), '["é"]'),
+    ],
+)
+def test_settings_are_written_as_toml(given, text):
+    assert _options.setting(given) == text
+
+
+@pytest.mark.parametrize(("given", "name"), [(None, "optim.lr"), ([1, None], "optim.lr"), ({"a": {"b": None}}, "optim.lr.a.b")])
+def test_a_setting_is_not_none(given, name):
+    with pytest.raises(TypeError, match=f"{name}: None; expected a value"):
+        _options.setting(given, "optim.lr")
 
 
 def test_errors_name_the_study_and_the_setting(tmp_path):

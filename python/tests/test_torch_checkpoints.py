@@ -77,6 +77,67 @@ def test_models_are_saved_and_loaded(home):
         load_pretrained("nothing")
 
 
+def test_an_existing_path_counts_before_a_name(home, rooms, tmp_path, monkeypatch):
+    from stable_worldmodel.wm._build import build
+
+    linear = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}
+    for name in ("both", "run"):
+        save_pretrained(build(lewm_config()), name, lewm_config())
+    monkeypatch.chdir(tmp_path)
+    assert isinstance(load_pretrained("both"), swm.wm.LeWM) and isinstance(swm.policy.AutoCostModel("both"), swm.wm.LeWM)
+    save_pretrained(torch.nn.Linear(2, 3), "both", linear, cache_dir=tmp_path / "other")
+    (tmp_path / "other/checkpoints/both").rename(tmp_path / "both")
+    swm.wm.train("gcbc", data=rooms, out="./run", preset="tiny", schedule__steps=1, data__batch_size=4)
+    for load in (load_pretrained, swm.policy.AutoCostModel):
+        assert isinstance(load("both"), torch.nn.Linear)
+        assert isinstance(load("both", cache_dir=home), swm.wm.LeWM), "the folder that is given counts first"
+    assert isinstance(load_pretrained("run"), swm.wm.GCRL)
+    assert swm.policy.AutoCostModel("run").card["family"] == swm.wm.load("run").card["family"] == "gcbc"
+    assert isinstance(swm.wm.GCRL.from_pretrained("run"), swm.wm.GCRL)
+
+
+def test_files_and_folders_without_a_checkpoint_hide_no_name(home, rooms, tmp_path, monkeypatch):
+    linear = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}
+    save_pretrained(torch.nn.Linear(2, 3), "saved", linear)
+    save_pretrained(torch.nn.Linear(2, 3), "given", linear, cache_dir=tmp_path / "cache")
+    swm.wm.train("gcbc", data=rooms, out="run", preset="tiny", schedule__steps=1, data__batch_size=4)
+    auto = swm.policy.AutoCostModel
+    # An empty folder, a folder of other files, and a file.
+    for i, make in enumerate((Path.mkdir, lambda path: (path / "checkpoint").mkdir(parents=True), Path.touch)):
+        (tmp_path / str(i)).mkdir()
+        monkeypatch.chdir(tmp_path / str(i))
+        for name in ("saved", "given", "run", "other"):
+            make(Path(name))
+        make(tmp_path / "cache" / str(i))
+        for load in (load_pretrained, auto):
+            assert isinstance(load("saved"), torch.nn.Linear)
+            assert isinstance(load("given", cache_dir=tmp_path / "cache"), torch.nn.Linear)
+            # It is what the error is about.
+            with pytest.raises((FileNotFoundError, RuntimeError, ValueError), match="config.json|other: "):
+                load("other")
+        assert isinstance(load_pretrained("run"), swm.wm.GCRL)
+        assert auto("run").path == str(home / "checkpoints/run")
+    assert isinstance(auto(home / "checkpoints/saved/weights.pt"), torch.nn.Linear)
+
+
+def test_models_are_saved_on_this_machine(home, rooms, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "user"))
+    linear = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}
+    for given in ({"run_name": "s3://bucket/x"}, {"run_name": "x", "cache_dir": "gs://bucket"}):
+        with pytest.raises(ValueError, match="is a URI; expected a path of this machine"):
+            save_pretrained(torch.nn.Linear(2, 3), config=linear, **given)
+    for given, folder in (({"run_name": "~/x"}, "x"), ({"run_name": "y", "cache_dir": "~/c"}, "c/checkpoints/y")):
+        save_pretrained(torch.nn.Linear(2, 3), config=linear, **given)
+        assert (tmp_path / "user" / folder / "weights.pt").is_file()
+    assert isinstance(load_pretrained("~/x"), torch.nn.Linear)
+    assert isinstance(load_pretrained("y", cache_dir="~/c"), torch.nn.Linear)
+    swm.wm.train("gcbc", data=rooms, preset="tiny", schedule__steps=1, data__batch_size=4)
+    swm.wm.GCRL.from_pretrained("gcbc-rooms").save_pretrained("~/z")
+    assert swm.wm.load("~/z").path == str(tmp_path / "user/z")
+    assert not (tmp_path / "~").exists() and not list(home.rglob("*:"))
+
+
 def test_weights_beside_another_configuration_are_loaded_with_a_warning(home):
     def config(name):
         return {"_target_": "torch.nn.Sequential", "_args_": [{"_target_": f"torch.nn.{name}"}]}

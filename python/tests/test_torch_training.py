@@ -237,6 +237,44 @@ def test_a_continued_training_equals_a_whole_one(family, dropout, rooms, swings,
         Trainer(Options(family, resume=True, **options))
 
 
+def test_a_continued_training_in_half_precision_equals_a_whole_one(rooms, tmp_path):
+    options = {"data": rooms, "preset": "tiny", "settings": SHORT, "device": "cpu", "amp": "fp16"}
+    whole = Trainer(Options("gcivl", out=str(tmp_path / "whole"), **options))
+    whole.train()
+    # The first steps are left out, because the scale of the loss is too large.
+    assert whole.scaler.get_scale() < 65536
+    Trainer(Options("gcivl", out=str(tmp_path / "run"), **options)).train(until=4)
+    shutil.copytree(tmp_path / "run", tmp_path / "single")
+    continued = Trainer(Options("gcivl", out=str(tmp_path / "run"), resume=True, **options))
+    continued.train()
+    assert continued.scaler.state_dict() == whole.scaler.state_dict()
+    for name in ("weights", "optimizer"):
+        found, expected = weights(tmp_path / "run", name), weights(tmp_path / "whole", name)
+        assert all(torch.equal(found[key], value) for key, value in expected.items()) and found.keys() == expected.keys()
+    # In single precision, the run continues in both programs.
+    shutil.copytree(tmp_path / "single", tmp_path / "engine")
+    made = {float(state["step"]) for state in whole.optimizer.adam.state.values()}
+    single = Trainer(Options("gcivl", out=str(tmp_path / "single"), resume=True, **{**options, "amp": "off"}))
+    single.train()
+    assert {float(state["step"]) for state in single.optimizer.adam.state.values()} == made != {6.0}
+    swm.wm.engine._command(["swm", "train", "--output", str(tmp_path / "engine"), "--resume"])
+    assert log_of(tmp_path / "engine")[-1]["step"] == 6
+
+
+def test_the_state_of_the_optimizer_does_not_depend_on_the_default_type(rooms, tmp_path):
+    trainer = Trainer(Options("gcivl", rooms, out=str(tmp_path / "run"), settings=SHORT, preset="tiny", device="cpu"))
+    trainer.train(until=1)
+    state = next(iter(trainer.optimizer.adam.state.values()))
+    state["step"] = torch.tensor(1001.0)
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        found = trainer.optimizer.moments(1003, trainer.scaler)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    (steps,) = (value for name, value in found.items() if name.startswith("steps."))
+    assert steps.dtype == torch.float32 and steps[0] == 1001
+
+
 @pytest.mark.parametrize("family", ["lewm", "dino_wm", "tdmpc2"])
 def test_the_engine_plans_with_what_torch_trained(family, rooms, swings, tmp_path):
     data, env = (swings, "swm/PendulumControl-v1") if family == "tdmpc2" else (rooms, "swm/TwoRoom-v1")
@@ -547,3 +585,28 @@ def test_a_second_training_in_a_folder_is_refused(rooms, tmp_path):
     (out / "train.jsonl").write_text('{"step": 1, "loss": 1.0}\n{"step": 2, "lo')
     Trainer(Options(**{**vars(options), "resume": True})).train()
     assert [line["step"] for line in log_of(out)] == [2, 4, 6]
+
+
+@pytest.mark.parametrize("by", ["engine", "torch"])
+def test_settings_of_a_call_are_written_as_the_command_reads_them(by, rooms, tmp_path):
+    given = {
+        "schedule__steps": np.int64(2),
+        "data__batch_size": 4,
+        "data__hold_out": False,
+        "optim__betas": (0.8, 0.5),
+        "optim__lr": np.float32(3e-4),
+        "model__encoder": {"conv": {"channels": np.array([6, 8]), "hidden": 12, "dim": 10}},
+    }
+    out = str(tmp_path / "run")
+    if by == "engine":
+        swm.wm.train("gcbc", data=rooms, out=out, preset="tiny", **given)
+        with pytest.raises(ValueError, match="resume=True"):
+            swm.wm.train("gcbc", data=rooms, out=out, preset="tiny", **given)
+        swm.wm.train("gcbc", data=rooms, out=out, preset="tiny", resume=True, **given)
+    else:
+        train("gcbc", rooms, out=out, preset="tiny", device="cpu", **given)
+    config = json.loads((tmp_path / "run/checkpoint/config.json").read_text())["config"]
+    assert config["data"]["hold_out"] is False and config["optim"]["betas"] == [0.8, 0.5]
+    assert config["optim"]["lr"] == 3e-4 and config["model"]["encoder"]["conv"]["channels"] == [6, 8]
+    with pytest.raises(ValueError, match="data.hold_out: is 'no', expected true or false"):
+        train("gcbc", rooms, out=str(tmp_path / "other"), preset="tiny", device="cpu", data__hold_out="no")

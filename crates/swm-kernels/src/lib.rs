@@ -1,4 +1,4 @@
-//! CPU kernels for planning and for training image encoders and hidden layers, on plain row-major `f32` slices.
+//! CPU kernels for planning and for training image encoders, hidden layers and small networks ([`ReluNetwork`]), on plain `f32` slices.
 //!
 //! A tensor library allocates and reads memory once per operation. Here weights are laid out once ([`Panels`]), scratch
 //! memory is reused ([`ScratchPool`]), and every row is computed independently, so no byte of a result depends on the

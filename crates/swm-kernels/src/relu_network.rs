@@ -267,7 +267,8 @@ mod tests {
             let of_x = network.input_gradient(&tape, &d_blocks, &mut scratch).to_vec();
             for i in (0..x.len()).step_by(17) {
                 let [mut more, mut less] = [x.clone(), x.clone()];
-                (more[i] += step, less[i] -= step);
+                more[i] += step;
+                less[i] -= step;
                 close(at(&of_x, inputs, i / inputs, i % inputs), base(&layers, &more), base(&layers, &less));
             }
             let gradients = network.weight_gradients(&in_blocks, &tape, &d_blocks, &mut scratch);

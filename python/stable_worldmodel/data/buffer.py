@@ -351,7 +351,15 @@ class ReplayBuffer(Dataset):
         return self._now.episodes()
 
     def dump(self, path: str | os.PathLike[str], format: str | None = None, mode: str = "overwrite", **kwargs: Any) -> None:
-        """Writes the content to a dataset of any format."""
+        """Writes the content to a dataset of any format.
+
+        Args:
+            path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
+            format: The format; `None` detects it from the path, or selects Lance.
+            mode: The treatment of an existing dataset: `"overwrite"` replaces it, as in the published package, `"append"` adds
+                to it, `"error"` raises. An empty buffer replaces nothing.
+            **kwargs: Further arguments of `open_writer`.
+        """
         with open_writer(path, format=format, mode=mode, **kwargs) as writer:
             writer.write_episodes(self.episodes())
 

@@ -116,9 +116,33 @@ class Dataset:
     def load_chunk(
         self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
     ) -> list[dict[str, Any]]:
-        """The rows `start[i] .. end[i]` of each episode `episodes_idx[i]`, as a list of dicts in the form of clips."""
-        runs = zip(*(_tensors.whole("load_chunk", part).tolist() for part in (episodes_idx, start, end)), strict=True)
+        """The rows `start[i] .. end[i]` of each episode `episodes_idx[i]`, as a list of dicts in the form of clips.
+
+        Raises:
+            IndexError: If an episode does not exist, or does not have these rows.
+            ValueError: If the sequences have other lengths, or there are actions and the rows are no multiple of `frameskip`.
+        """
+        episodes, starts, ends = self._chunks(episodes_idx, start, end)
+        runs = zip(episodes.tolist(), starts.tolist(), ends.tolist(), strict=True)
         return [self._grouped(self._load_slice(e, s, t), (t - s) // self.frameskip) for e, s, t in runs]
+
+    def _chunks(self, episodes_idx: Any, start: Any, end: Any) -> tuple[Array, Array, Array]:
+        """The episodes, first rows and ends of :meth:`load_chunk`, checked; negative episodes count from the last one."""
+        episodes, starts, ends = _runs(episodes_idx, start, end)
+        rows = ends - starts
+        if (rows % self.frameskip).any() and "action" in self.column_names:
+            raise ValueError(f"load_chunk: {rows.tolist()} rows are no multiples of frameskip {self.frameskip}")
+        return self._counted(episodes, starts, ends), starts, ends
+
+    def _counted(self, episodes: Array, starts: Array, ends: Array) -> Array:
+        """The episodes of runs of rows, counted from the first one, if they exist and have these rows."""
+        total = self.num_episodes
+        for episode, start, end in zip(episodes, starts, ends, strict=True):
+            if not -total <= episode < total:
+                raise IndexError(f"episode {episode} is outside the dataset, which has {total} episodes")
+            if not 0 <= start <= end <= self.lengths[episode]:
+                raise IndexError(f"rows {start} .. {end} are outside episode {episode}, which has {self.lengths[episode]} rows")
+        return np.where(episodes < 0, episodes + total, episodes)
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
         """A whole episode: all rows of `action`, every `frameskip`-th row of other columns."""
@@ -315,18 +339,10 @@ class StoredDataset(Dataset):
                     found[name] = self._merged[name][np.concatenate(at)] if at else self._merged[name][:0]
         return {name: found[name] for name in names}
 
-    def _check_runs(self, episodes: Array, starts: Array, ends: Array) -> None:
-        for episode, start, end in zip(episodes, starts, ends, strict=True):
-            if not 0 <= episode < self.num_episodes:
-                raise IndexError(f"episode {episode} is outside the dataset, which has {self.num_episodes} episodes")
-            if not 0 <= start <= end <= self.lengths[episode]:
-                raise IndexError(f"rows {start} .. {end} are outside episode {episode}, which has {self.lengths[episode]} rows")
-
     def _slices(self, episodes: Array, starts: Array, ends: Array) -> list[dict[str, Any]]:
         """One dict for each run of rows, read in one call of the engine."""
         episodes, starts, ends = (np.asarray(part, dtype=np.int64) for part in (episodes, starts, ends))
-        episodes = np.where(episodes < 0, episodes + self.num_episodes, episodes)
-        self._check_runs(episodes, starts, ends)
+        episodes = self._counted(episodes, starts, ends)
         found = self._read(self._keys, episodes, starts, ends - starts, self.frameskip)
         counts = {False: -(-(ends - starts) // self.frameskip), True: ends - starts}
         cuts = {action: np.cumsum(count)[:-1] for action, count in counts.items()}
@@ -344,10 +360,8 @@ class StoredDataset(Dataset):
     def load_chunk(
         self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
     ) -> list[dict[str, Any]]:
-        episodes, starts, ends = (_tensors.whole("load_chunk", part) for part in (episodes_idx, start, end))
-        steps, rest = np.divmod(ends - starts, self.frameskip)
-        if "action" in self._keys and rest.any():
-            raise ValueError(f"load_chunk: {(ends - starts).tolist()} rows are no multiples of frameskip {self.frameskip}")
+        episodes, starts, ends = self._chunks(episodes_idx, start, end)
+        steps = (ends - starts) // self.frameskip
         samples = self._slices(episodes, starts, ends)
         return [self._grouped(sample, int(count)) for sample, count in zip(samples, steps, strict=True)]
 
@@ -408,6 +422,17 @@ class StoredDataset(Dataset):
         self._merged[target], self._view = merged, None
         if target not in self._keys:
             self._keys.append(target)
+
+
+def _runs(episodes_idx: Any, start: Any, end: Any) -> tuple[Array, Array, Array]:
+    """The arguments of `load_chunk` as arrays of one length."""
+    episodes, starts, ends = (_tensors.whole("load_chunk", part) for part in (episodes_idx, start, end))
+    if episodes.ndim != 1 or not episodes.shape == starts.shape == ends.shape:
+        raise ValueError(
+            "load_chunk: expected sequences of one length as episodes_idx, start and end, "
+            f"got the shapes {episodes.shape}, {starts.shape} and {ends.shape}"
+        )
+    return episodes, starts, ends
 
 
 def _check_same_clips(name: str, datasets: Sequence[Any]) -> None:
@@ -639,8 +664,8 @@ class ConcatDataset:
 
     def load_chunk(self, episodes_idx: Any, start: Any, end: Any) -> list[dict[str, Any]]:
         """See :meth:`Dataset.load_chunk`."""
-        parts, episodes = self._locate(self._episodes_before, episodes_idx, "episodes")
-        starts, ends = np.asarray(start), np.asarray(end)
+        episodes, starts, ends = _runs(episodes_idx, start, end)
+        parts, episodes = self._locate(self._episodes_before, episodes, "episodes")
         return self._gathered(
             parts, lambda part, mask: self.datasets[part].load_chunk(episodes[mask], starts[mask], ends[mask])
         )
@@ -792,7 +817,8 @@ class GoalDataset:
         goal_keys: Mapping[str, str] | None = None,
         seed: int | None = None,
     ) -> None:
-        if len(goal_probabilities) != 4 or min(goal_probabilities) < 0 or not np.isclose(sum(goal_probabilities), 1.0):
+        total = sum(goal_probabilities)
+        if len(goal_probabilities) != 4 or min(goal_probabilities) < 0 or not np.isclose(total, 1.0):
             raise ValueError(
                 "goal_probabilities: expected the chances (random, geometric future, uniform future, current), "
                 f"which add up to 1, got {tuple(goal_probabilities)}"
@@ -800,7 +826,8 @@ class GoalDataset:
         if not 0 <= gamma < 1:
             raise ValueError(f"gamma: expected at least 0 and below 1, got {gamma}")
         self.dataset = dataset
-        self.goal_probabilities = tuple(goal_probabilities)
+        # Rounded thirds add up to 1 only nearly, which draws do not accept.
+        self.goal_probabilities = tuple(float(chance / total) for chance in goal_probabilities)
         self.gamma = gamma
         offset = dataset.num_steps if current_goal_offset is None else current_goal_offset
         self.current_goal_offset = int(_tensors.whole("current_goal_offset", offset))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stable_worldmodel import _engine
+from stable_worldmodel import _engine, _files
 
 from . import _tensors
 from .dataset import Transform
@@ -36,7 +36,7 @@ __all__ = [
 
 def get_cache_dir(override_root: str | Path | None = None, sub_folder: str | None = None) -> Path:
     """The home folder (`$STABLEWM_HOME`), or a folder in it; created if it does not exist."""
-    folder = Path(_engine.home() if override_root is None else override_root)
+    folder = Path(_engine.home()) if override_root is None else _files.local("override_root", override_root)
     folder = folder if sub_folder is None else folder / sub_folder
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -44,7 +44,7 @@ def get_cache_dir(override_root: str | Path | None = None, sub_folder: str | Non
 
 def ensure_dir_exists(path: str | Path) -> None:
     """Creates a folder if it does not exist."""
-    Path(path).mkdir(parents=True, exist_ok=True)
+    _files.local("path", path).mkdir(parents=True, exist_ok=True)
 
 
 def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None = None) -> str:
@@ -52,7 +52,7 @@ def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | N
     text = os.fspath(given)
     if "://" in text:
         return text
-    datasets = Path(_engine.home() if cache_dir is None else cache_dir) / "datasets"
+    datasets = Path(_engine.home() if cache_dir is None else cache_dir).expanduser() / "datasets"
     # The dataset `OWNER/NAME` of a hub is stored as `OWNER--NAME`.
     candidates = [Path(text), datasets / text, datasets / text.replace("/", "--")]
     if cache_dir is not None:
@@ -208,7 +208,8 @@ def convert(
         convert("pusht.lance", "pusht-video", dest_format="video")
 
     Args:
-        source: A path, a URI, a name, or an open dataset.
+        source: A path, a URI, a name, or an open dataset, of which all rows and columns are written as they are stored:
+            `frameskip`, `keys_to_load` and `transform` concern its samples only.
         dest: The target. Its name determines the format unless `dest_format` is given; Lance otherwise.
         source_format: The source's format; `None` detects it from the path.
         dest_format: The format to write.
@@ -280,7 +281,7 @@ def merge(
     """Writes the episodes of several datasets, one after another, into one dataset.
 
     Args:
-        sources: Paths, URIs, names, or open datasets.
+        sources: Paths, URIs, names, or open datasets, whose stored rows are written, as in `convert`.
         dest: The target. Its name determines the format unless `dest_format` is given; Lance otherwise.
         dest_format: The format to write.
         source_formats: The format of all sources, or of each; `None` detects it from the path.
@@ -359,7 +360,7 @@ def inspect(dataset: Any, *, checksum: bool = False) -> dict[str, Any]:
     """Describes a dataset.
 
     Args:
-        dataset: A path, a URI, a name, or an open dataset.
+        dataset: A path, a URI, a name, or an open dataset, whose stored columns are described.
         checksum: Whether to read all rows and hash the decoded content; the hash does not depend on the format.
 
     Returns:

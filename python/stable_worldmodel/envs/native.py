@@ -111,10 +111,16 @@ class NativeEnv(gymnasium.Env):
         return self._observation(columns), self._info(columns, self._env.is_success())
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Applies an action."""
-        continuous = isinstance(self.action_space, gymnasium.spaces.Box)
-        action = np.ascontiguousarray(action, dtype=np.float32 if continuous else np.int64).reshape(-1)
-        columns, reward, terminated, truncated, success = self._env.step(action)
+        """Applies an action.
+
+        Raises:
+            ValueError: If it is no action of the space: of another shape, or not finite, real, and whole where the space is.
+        """
+        dtype = np.float32 if isinstance(self.action_space, gymnasium.spaces.Box) else np.int64
+        action = np.asarray(action)
+        if action.dtype != dtype:
+            action = _as_action(action, dtype)
+        columns, reward, terminated, truncated, success = self._env.step(np.ascontiguousarray(action).reshape(-1))
         return self._observation(columns), reward, terminated, truncated, self._info(columns, success)
 
     def render(self) -> np.ndarray | None:
@@ -184,3 +190,22 @@ class NativeEnv(gymnasium.Env):
         columns["success"] = success
         columns["goal_distance"] = self._env.goal_distance()
         return columns
+
+
+#: The types of objects that are no real numbers, and that numpy would convert to some.
+_NOT_REAL = (str, bytes, complex, type(None))
+
+
+def _as_action(given: np.ndarray, dtype: Any) -> np.ndarray:
+    """An action in the type of the space, without what the conversion would lose.
+
+    Raises:
+        ValueError: If it has texts, `None`, complex numbers, or fractions where whole numbers are expected.
+    """
+    kind = given.dtype.kind
+    if kind not in "biufO" or (kind == "O" and any(isinstance(value, _NOT_REAL) for value in given.flat)):
+        raise ValueError(f"step: expected real actions, got {'complex numbers' if kind == 'c' else given!r}")
+    values = given.astype(np.float64) if kind == "O" else given
+    if dtype == np.int64 and values.dtype.kind == "f" and not (np.isfinite(values) & (values == np.floor(values))).all():
+        raise ValueError(f"step: expected whole numbers, got {given}; choose one of the action space")
+    return values.astype(dtype)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import _engine
+from .. import _engine, _files
 
 __all__ = ["save_panel_videos", "save_video"]
 
@@ -21,10 +20,13 @@ def save_video(path: str | os.PathLike[str], frames: Sequence[Any] | np.ndarray,
         path: The file. Its folder is created; an existing file is replaced only if it is such a video.
         frames: Frames `(height, width, 3)` of `uint8`.
         fps: Frames per second.
+
+    Raises:
+        ValueError: If the path is a URI, or the frames have another type or shape.
     """
     if len(frames) == 0:
         return
-    path = Path(path)
+    path = _files.local("path", path)
     path.parent.mkdir(parents=True, exist_ok=True)
     stacked = np.stack([np.asarray(frame) for frame in frames])
     if stacked.dtype != np.uint8 or stacked.ndim != 4:
@@ -43,14 +45,17 @@ def save_panel_videos(
             `(height, width, 3)` that is shown all the time. All frames have the same size. A shorter panel keeps its last
             frame.
         fps: Frames per second.
+
+    Raises:
+        ValueError: If the folder is a URI.
     """
-    labels = list(panels)
+    folder, labels = _files.local("video_dir", video_dir), list(panels)
     for env in range(len(panels[labels[0]])):
         videos = [np.asarray(panels[label][env]) for label in labels]
         videos = [video if video.ndim == 4 else video[None] for video in videos]
         count = max(len(video) for video in videos)
         frames = [_panel(labels, [video[min(step, len(video) - 1)] for video in videos]) for step in range(count)]
-        save_video(Path(video_dir) / f"env_{env}.mp4", frames, fps)
+        save_video(folder / f"env_{env}.mp4", frames, fps)
 
 
 def _panel(labels: Sequence[str], frames: Sequence[np.ndarray]) -> np.ndarray:

@@ -26,6 +26,7 @@ try:
 except ImportError as error:
     raise ImportError('Ray is not installed: pip install "stable-worldmodel-rs[ray]"') from error
 
+from .. import _options
 from .._process import module_command
 from .driver import CellsFailed, RunRefused, execute, read_request
 from .fit import fit
@@ -79,10 +80,9 @@ def study(
 
     With `until`, such as `ci=5`, the results decide how many starts are played, in stages.
     """
-    from ..studies import _toml
 
     arguments = ["study", "run", os.fspath(study), "--output", os.fspath(output)]
-    arguments += [f"{name.replace('_', '-')}={_toml(value)}" for name, value in settings.items()]
+    arguments += [f"{name.replace('_', '-')}={_options.setting(value, name)}" for name, value in settings.items()]
     options = {"small": small, "trust": trust, "until": until, "resources": resources, "wait": wait, "run_folder": run_folder}
     return submit(arguments, options)
 

@@ -64,8 +64,8 @@ class Trainer:
         self.model.to(self.device)
         self.losses: Losses = losses(self.model, self.ranks, self._precision, self._compiled)
         self.optimizer = Optimizer(self.model, plan["parameters"], self.config["optim"])
-        self.optimizer.restore(state["step"], read_safetensors(self.run / "checkpoint/optimizer.safetensors"))
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=options.amp == "fp16")
+        self.optimizer.restore(state["step"], read_safetensors(self.run / "checkpoint/optimizer.safetensors"), self.scaler)
         self.step: int = state["step"]
         self.window = Window.of(state.get("window"), self.losses.names)
         #: Whether the folder was found as this training read it, and `run.json` has the command.
@@ -304,7 +304,8 @@ class Trainer:
         stored.manifest.update(device)
         parts: dict[str, Any] = {}
         if state is not None:
-            parts = {"state": state, "moments": self.optimizer.moments(), "raw": None if self.average is None else weights}
+            moments = self.optimizer.moments(self.step, self.scaler)
+            parts = {"state": state, "moments": moments, "raw": None if self.average is None else weights}
         averaged = weights if self.average is None else self.average
         return self.ranks.first(lambda: write(run, stored, averaged, replace=True, **parts))  # type: ignore[no-any-return]
 

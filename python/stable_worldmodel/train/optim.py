@@ -36,6 +36,8 @@ class Optimizer:
             self.parameters[name] = parameter
             self.clipped.setdefault(clip, []).append(parameter)
             by_rate.setdefault(rate, []).append(parameter)
+        #: The name of the smallest trained parameter.
+        self._smallest = min(self.parameters, key=lambda name: (self.parameters[name].numel(), name))
         #: Whether a GPU updates all weights with one kernel, which counts steps on the GPU.
         self._fused = all(parameter.is_cuda for parameter in self.parameters.values())
         self.adam = torch.optim.AdamW(
@@ -77,23 +79,50 @@ class Optimizer:
         scaler.update()
         return norm
 
-    def moments(self) -> dict[str, Tensor]:
-        """The state, as a checkpoint holds it: `first.NAME` and `second.NAME`, flattened."""
+    def moments(self, done: int, scaler: Any) -> dict[str, Tensor]:
+        """The state, as a checkpoint holds it: `first.NAME` and `second.NAME`, flattened.
+
+        A training in half precision also has the scale of its loss (`scale.NAME`), the steps since the scale changed
+        (`growth.NAME`), and, as some steps are left out, the number of the others (`steps.NAME`).
+
+        Args:
+            done: The number of steps of the training.
+            scaler: The scaler of the loss in half precision.
+        """
         found = {}
         for name, parameter in self.parameters.items():
             state = self.adam.state.get(parameter)
             if state:
                 found[f"first.{name}"] = state["exp_avg"].flatten()
                 found[f"second.{name}"] = state["exp_avg_sq"].flatten()
-        return found
+        values = {}
+        if (steps := max((float(state["step"]) for state in self.adam.state.values()), default=0.0)) != done:
+            values["steps"] = steps
+        if scaler.is_enabled():
+            state = scaler.state_dict()
+            values |= {"scale": float(state["scale"]), "growth": float(state["_growth_tracker"])}
+        # The engine continues runs whose tensors have the sizes of weights, so the value is repeated for the smallest one.
+        size = self.parameters[self._smallest].numel()
+        # Not of torch's default type, which a program can set to one that rounds the number of steps.
+        repeated = {part: torch.full((size,), value, dtype=torch.float32) for part, value in values.items()}
+        return found | {f"{part}.{self._smallest}": tensor for part, tensor in repeated.items()}
 
-    def restore(self, steps: int, moments: Mapping[str, Tensor]) -> None:
-        """Restores a state that was taken after `steps` steps."""
+    def restore(self, done: int, moments: Mapping[str, Tensor], scaler: Any) -> None:
+        """Restores the state of `moments`, and that of the scaler if it is in use."""
+        values = {
+            part: float(moments[key][0])
+            for part in ("steps", "scale", "growth")
+            if (key := f"{part}.{self._smallest}") in moments
+        }
+        if scaler.is_enabled() and "scale" in values:
+            state = {"scale": values["scale"], "_growth_tracker": int(values["growth"])}
+            scaler.load_state_dict({**scaler.state_dict(), **state})
+        steps = values.get("steps", float(done))
         for name, parameter in self.parameters.items():
             if f"first.{name}" in moments:
                 first, second = (moments[f"{part}.{name}"].view_as(parameter) for part in ("first", "second"))
                 self.adam.state[parameter] = {
-                    "step": torch.tensor(float(steps), device=parameter.device if self._fused else "cpu"),
+                    "step": torch.tensor(steps, device=parameter.device if self._fused else "cpu"),
                     "exp_avg": first.to(parameter),
                     "exp_avg_sq": second.to(parameter),
                 }

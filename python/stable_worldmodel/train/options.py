@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from .. import _files
+from .. import _files, _options
 
 __all__ = ["Options", "called", "parsed"]
 
@@ -141,4 +141,4 @@ def _value(key: str, value: str, default: Any) -> Any:
 
 def settings_of(overrides: Mapping[str, Any]) -> list[str]:
     """Settings given as keyword arguments, with `__` for dots, as `key=value`."""
-    return [f"{key.replace('__', '.')}={value}" for key, value in overrides.items()]
+    return [f"{key.replace('__', '.')}={_options.setting(value, key)}" for key, value in overrides.items()]

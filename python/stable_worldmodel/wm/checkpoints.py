@@ -28,7 +28,7 @@ from .prejepa.module import Embedder as ColumnEmbedder
 from .pretrained import Pretrained, Stored
 from .tdmpc2 import TDMPC2
 
-__all__ = ["check_kind", "is_stored", "load", "module_of"]
+__all__ = ["check_kind", "load", "module_of"]
 
 Model = TypeVar("Model", bound=Pretrained)
 
@@ -83,11 +83,6 @@ def check_kind(family: str, kind: type[Pretrained] | None) -> None:
     if kind is not None and not issubclass(kind, known) and not issubclass(known, kind):
         name = known.__name__
         raise TypeError(f"a model of the family {family!r} is a {name}, not a {kind.__name__}; derive the class from {name}")
-
-
-def is_stored(path: Path) -> bool:
-    """Whether a checkpoint of the engine is at a path: a run, the folder `checkpoint` in it, or a capsule."""
-    return path.suffix == ".safetensors" if not path.is_dir() else _folder_of(path) is not None
 
 
 def _folder_of(path: Path) -> Path | None:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import _engine
+from .. import _engine, _options
 from ..planning.adapter import has_torch
 from ..planning.solver.engine import last_step
 
@@ -30,8 +30,8 @@ class Model:
     """A checkpoint, for planning (`get_cost`) or for acting (`swm.policy.FeedForwardPolicy`).
 
     Args:
-        name: A name under `$STABLEWM_HOME/checkpoints`, the path of a checkpoint or a capsule, or `zoo:` and the name of a
-            capsule (`swm zoo` lists them).
+        name: The path of a checkpoint or a capsule, a name under `$STABLEWM_HOME/checkpoints`, or `zoo:` and the name of a
+            capsule (`swm zoo` lists them). An existing path counts before a name.
         device: `cpu`, or a GPU if the engine was built with GPU support.
         objective: The planning objective, a dict with `terms` and `constraints`, such as
             `{"terms": [{"term": "control", "weight": 0.01}]}`; `None` for the model's own cost.
@@ -137,6 +137,7 @@ def train(
     out: str | None = None,
     preset: str | None = None,
     device: str = "cpu",
+    resume: bool = False,
     **overrides: Any,
 ) -> str:
     """Trains a model with `swm train`.
@@ -148,7 +149,9 @@ def train(
         out: The checkpoint's name or path; for `None`, the name `MODEL-DATASET` or `MODEL-ENV`.
         preset: The name of a configuration; the first one of the family for `None`.
         device: `cpu`, or a GPU if the engine was built with GPU support.
-        **overrides: Settings that replace the preset's settings, with `__` for dots: `schedule__steps=1000`.
+        resume: Whether to continue an interrupted training of the checkpoint.
+        **overrides: Settings that replace the preset's settings, with `__` for dots: `schedule__steps=1000`. Booleans,
+            sequences, dicts and values of numpy are written as TOML; a text is as on the command line.
 
     Returns:
         `out`, or the name that stands for `None`.
@@ -161,7 +164,8 @@ def train(
     for flag, value in (("--data", data), ("--env", env), ("--output", out), ("--preset", preset), ("--device", device)):
         if value is not None:
             arguments += [flag, str(value)]
-    arguments += [f"{key.replace('__', '.')}={value}" for key, value in overrides.items()]
+    arguments += ["--resume"] * bool(resume)
+    arguments += [f"{key.replace('__', '.')}={_options.setting(value, key)}" for key, value in overrides.items()]
     _command(arguments)
     return str(out)
 

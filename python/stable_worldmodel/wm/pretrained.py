@@ -66,8 +66,8 @@ class Pretrained(nn.Module):
         """Loads a checkpoint of the engine as a module of this class, in evaluation mode.
 
         Args:
-            name: A name under `$STABLEWM_HOME/checkpoints`, the path of a run or of a capsule, or `zoo:` and the name of a
-                capsule.
+            name: The path of a run or of a capsule, a name under `$STABLEWM_HOME/checkpoints`, or `zoo:` and the name of a
+                capsule. An existing path counts before a name.
 
         Raises:
             FileNotFoundError: If there is no such checkpoint.
@@ -121,7 +121,7 @@ class Pretrained(nn.Module):
 
 def run_path(name: str | os.PathLike[str]) -> Path:
     """The folder of a checkpoint to write: a path, or a name under `$STABLEWM_HOME/checkpoints`."""
-    path = Path(name)
+    path = Path(os.path.expanduser(name))
     if "://" in str(name) or not path.name:
         raise ValueError(f"path: expected a name or a local folder for the checkpoint, got {str(name)!r}")
     if path.is_absolute() or len(path.parts) > 1 or str(name).startswith("."):

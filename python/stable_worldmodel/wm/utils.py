@@ -21,8 +21,9 @@ from torch import nn
 from .. import _engine, _files
 from ._bounds import bounded
 from ._build import build
+from ._located import home_of, is_stored, located
 from ._weights import load_into, read_state_dict
-from .checkpoints import is_stored, module_of
+from .checkpoints import module_of
 
 __all__ = ["load_pretrained", "save_pretrained"]
 
@@ -38,10 +39,6 @@ _LARGEST = 1 << 20
 
 #: The largest size of a configuration, in bytes.
 _MOST_SETTINGS = 16 << 20
-
-
-def _folder(cache_dir: str | os.PathLike[str] | None) -> Path:
-    return Path(_engine.home() if cache_dir is None else cache_dir) / "checkpoints"
 
 
 def save_pretrained(
@@ -64,10 +61,12 @@ def save_pretrained(
         cache_dir: A folder in place of `$STABLEWM_HOME`.
 
     Raises:
-        ValueError: If the name of the file is no plain name, or that of another file of a checkpoint.
+        ValueError: If the name of the file is no plain name, or that of another file of a checkpoint, or a folder is a URI.
         FileExistsError: If the folder has a checkpoint of the engine, or a file to replace is none that this function writes.
     """
-    folder = _folder(cache_dir) / run_name
+    if cache_dir is not None:
+        cache_dir = _files.local("cache_dir", cache_dir)
+    folder = home_of(cache_dir) / "checkpoints" / _files.local("run_name", run_name)
     settings, stored = folder / "config.json", folder / filename
     is_plain = filename and Path(filename).name == filename and filename not in ("config.json", "manifest.json")
     if not is_plain or Path(filename).suffix == ".safetensors":
@@ -160,12 +159,13 @@ def load_pretrained(
     Args:
         name: A path, or a name under `$STABLEWM_HOME/checkpoints`: a run of `swm train`, a capsule, a folder with one `.pt`
             file and `config.json`, or the `.pt` file; or `zoo:` and the name of a capsule. `OWNER/NAME` also names a folder
-            that the Hugging Face hub's client or `swm pull` stored as `models--OWNER--NAME`.
-        cache_dir: A folder in place of `$STABLEWM_HOME`.
+            that the Hugging Face hub's client or `swm pull` stored as `models--OWNER--NAME`. A path that holds a
+            checkpoint counts before a name, as in `swm.policy.AutoCostModel`.
+        cache_dir: A folder in place of `$STABLEWM_HOME`, whose names count before paths.
         extra_args: Values of the configuration to replace, by dot key.
         trust: Whether a `_target_` may name any function, which is imported and called.
     """
-    path = _located(str(name), _folder(cache_dir))
+    path = _existing(str(name), cache_dir)
     if is_stored(path):
         if extra_args:
             raise ValueError("extra_args: the configuration of a checkpoint of the engine cannot be changed")
@@ -240,23 +240,23 @@ def _largest(config: Any) -> int:
     return config if isinstance(config, int) else 0
 
 
-def _located(name: str, folder: Path) -> Path:
+def _existing(name: str, cache_dir: str | os.PathLike[str] | None) -> Path:
     """The file or folder of a checkpoint."""
     if name.startswith("zoo:"):
         return Path(_engine.Model(name, "cpu", "null", False).path)
-    candidates = [folder / name, Path(name), folder / f"models--{name.replace('/', '--')}"]
-    for candidate in candidates:
-        if candidate.exists():
-            return candidate
-    raise FileNotFoundError(
-        f"there is no checkpoint {name!r}: neither a path nor a name under {folder}; `swm pull` downloads one"
-    )
+    path = located(name, cache_dir)
+    if path is None:
+        folder = home_of(cache_dir) / "checkpoints"
+        raise FileNotFoundError(
+            f"there is no checkpoint {name!r}: neither a path nor a name under {folder}; `swm pull` downloads one"
+        )
+    return path
 
 
 def _only_weights(folder: Path) -> Path:
     files = sorted(file for file in folder.glob("*.pt") if file.is_file())
     if not files:
-        raise FileNotFoundError(f"{folder}: it has no .pt file")
+        raise FileNotFoundError(f"{folder}: it has no .pt file; if a checkpoint elsewhere has this name, give its whole path")
     if len(files) > 1:
         raise ValueError(f"{folder}: it has several .pt files; name one: {', '.join(file.name for file in files)}")
     return files[0]

@@ -6,6 +6,7 @@ import ast
 import hashlib
 import json
 import os
+import re
 import secrets
 import sys
 import warnings
@@ -25,6 +26,7 @@ from ..wrapper.visual import engine_wrappers
 from .env_pool import WorldEnvs
 from .experts import check_experts
 from .metrics import Metrics
+from .records import collected_policy, evaluation_manifest, policy_name, stored_policy, wrapper_records, wrapper_words
 from .transforms import FrameTransforms
 
 __all__ = ["World"]
@@ -120,6 +122,13 @@ class World:
         #: Whether wrappers written in Python change the environments.
         self._wrapped_in_python = in_engine is None
         self._native = in_engine is not None and self._is_native(env_name)
+        #: For manifests: the factories of all wrappers, whether the engine's ones change the frame of the goal, and the
+        #: interpolation of frames if it is not that of the environment.
+        self._wrappers, self._wrap_goal = wrappers, bool(wrap_goal)
+        self._resampled: str | None = None
+        #: The descriptions of wrappers and transforms, from the first collection or evaluation on that has a manifest.
+        self._recorded: tuple[list[tuple[str, Any, str | None]], dict[str, tuple[Any, str | None]]] | None = None
+        self._image = image
         #: The Gymnasium environments of this world that run in this interpreter.
         self.gym_envs: list[Any] = []
         if in_engine is None and workers:
@@ -130,7 +139,7 @@ class World:
                 raise ValueError(f"views: {list(views)!r}; {problem}: leave them out, or leave out the wrappers")
             name, *given = env_name.split(",")
             settings = {**dict(word.split("=", 1) for word in given), **kwargs}
-            self._world, self.gym_envs, self._wrapping = _gym.open_world(
+            self._world, self.gym_envs, self._wrapping, self._resampled = _gym.open_world(
                 name, settings, self.num_envs, wrappers, image, max_episode_steps, nearest, threads, wrap_goal
             )
         else:
@@ -575,16 +584,20 @@ class World:
             path: The target: a path, a URI of an object store, or a name under `$STABLEWM_HOME/datasets`.
             episodes: The number of episodes.
             seed: The seed, which is combined with the index of each episode; random for `None`.
-            options: Factors to sample (`variation`) and to pin (`variation_values`).
+            options: Factors to sample (`variation`) and to pin (`variation_values`). `variation` replaces the factors that a
+                reset samples by itself, such as the start: name these as well, or all episodes start alike.
             format: One of `swm.data.list_formats()`. `None` selects the format by the path's suffix, or Lance.
             writer: Instead of a path: an object with `write_episode(dict of arrays)`, such as `swm.data.ReplayBuffer`.
             progress: Whether to show progress.
             dataset_path: Another name for `path`.
             policy: The policy to set first; `None` keeps the policy of `set_policy`. A dict of weights by policy name, such as
                 `{"expert": 0.7, "random": 0.3}`, stands for `swm.policy.MixturePolicy`. The manifest has the policy's name,
-                and the `seed` of a policy of the engine: `random,seed=3`.
+                the `seed` of a policy of the engine (`random,seed=3`), the settings of a planner, and the hash of the weights
+                of torch modules. A policy of your own is recorded by its `type` or the name of its class, and such a hash.
             mode: The treatment of an existing dataset: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
-                more, `"resume"` continues until the dataset has `episodes`.
+                more, `"resume"` continues until the dataset has `episodes`. Both continue only with the recorded settings,
+                policy and wrappers. A policy of your own that learns begins its dataset with `"append"`, too, which records
+                no weights of it.
             codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
             goal: Whether to store the frame of the goal in every row.
             strict_finite: Whether NaN and infinite values raise an error. Otherwise they are stored and counted in the
@@ -618,16 +631,29 @@ class World:
 
             first = foreign_episodes(path, format, mode)
             writer = foreign_writer(path, format, mode)
+        is_stored = writer is None
+        begun = stored_policy(str(path), format) if is_stored and mode == "append" else ""
+        # A policy of the user may learn between collections: its weights are compared if the dataset was begun with them.
+        learns = mode == "append" and is_overridden(policy, "get_action") and ",weights=" not in begun
+        recorded, problem = collected_policy(policy, self, is_stored=is_stored, with_weights=not learns)
+        if begun and recorded != begun and _without_weights(recorded) == _without_weights(begun):
+            raise ValueError(
+                f"World.collect: mode='append': the dataset records policy {begun}, and this is policy {recorded}; they "
+                "differ in their weights; for a policy that learns, take a class of your own with get_action and begin the "
+                "dataset with mode='append' as well, which records no weights of it, or collect into another dataset"
+            )
+        wrappers, unknown = wrapper_records(self, policy) if is_stored else ([], None)
+        problem = ", ".join(filter(None, (problem, unknown)))
         config: dict[str, Any] = {
             "episodes": episodes,
             "seed": _seed(seed),
             "variation": _options.variation(_without_states(options), self.spec["variation"]),
-            "policy": (None if is_overridden(policy, "get_action") else getattr(policy, "_choice", None)) or _recorded(policy),
+            "policy": recorded,
             "action_noise": action_noise or float(getattr(policy, "action_noise", 0.0)),
             "goal": bool(goal),
             "first": first,
             "strict_finite": bool(strict_finite),
-            "wrappers": [{"id": id, "settings": settings} for id, settings in self._wrapping],
+            "wrappers": wrappers,
         }
         if writer is not None:
             failed: BaseException | None = None
@@ -642,8 +668,15 @@ class World:
             # The writer suppressed the error, but there is no collection to report.
             assert failed is not None
             raise failed
-        if mode == "append":
-            config["episodes"] += _engine.World.stored(str(path), format) or 0
+        if mode == "append" or (mode == "resume" and problem):
+            stored = _engine.World.stored(str(path), format) or 0
+            if stored and problem:
+                raise ValueError(
+                    f"World.collect: mode={mode!r} continues a dataset with the policy and the wrappers that it records, and "
+                    f"these cannot be recorded: {problem}; use a class, or functools.partial of one with plain values, in "
+                    "their place, or collect into another dataset"
+                )
+            config["episodes"] += stored if mode == "append" else 0
         engine_mode = {"error": "create", "resume": "append"}.get(mode, mode)
         return self._collect(policy, str(path), None, format, engine_mode, codec, config, progress)
 
@@ -699,8 +732,10 @@ class World:
         Args:
             episodes: The number of episodes; 50, or the length of `episodes_idx`, for `None`.
             seed: The seed of starts, goals, factors and plans; random for `None`.
-            options: Factors to sample (`variation`) and to pin (`variation_values`).
-            video: A folder for videos of the first episodes, with their first frames as PNG files beside them.
+            options: Factors to sample (`variation`) and to pin (`variation_values`). `variation` replaces the factors that a
+                reset samples by itself, such as the start: name these as well, or all episodes start alike.
+            video: A folder for videos of the first episodes, with their first frames as PNG files beside them. Those of an
+                earlier evaluation are replaced. `swm report` shows videos in the folder of the saved results, or below.
             dataset: The dataset of starts and goals: a `swm.data.Dataset`, its path, URI or name.
             episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
             goal_offset: The number of steps from a start to its goal; 25 for `None`.
@@ -716,7 +751,7 @@ class World:
             hold: Consecutive steps that must satisfy the goal (with `"strict"`).
             floor: Whether to evaluate the random policy on the same starts.
             videos: The number of episodes to record with `video`; all for `None`.
-            condition: A description of the distribution shift, for reports.
+            condition: A description of the distribution shift, for reports; the factors and visual wrappers for `None`.
             progress: Whether to show progress.
 
         Returns:
@@ -746,17 +781,20 @@ class World:
             "episodes": episodes,
             "seed": _seed(seed),
             "variation": variation,
-            "condition": condition or _describe(variation),
+            "condition": condition or _describe(variation, wrapper_words(self)),
             "budget": eval_budget,
             "counting": {"strict": {"hold": hold}} if protocol == "strict" else {"compat": {"envs": self.num_envs}},
             "picks": picks,
             "goal_offset": goal_offset or 0,
             "callables": self._callables(_options.callables(callables)) if dataset is not None else [],
         }
-        acting: list[tuple[str, Any]] = [(_name(policy), self._playing(policy))]
+        acting: list[tuple[str, Any]] = [(policy_name(policy, self), self._playing(policy))]
         if floor and acting[0][0] != "random":
             acting.append(("random", _engine.Actor.random(self._world, None)))
+        # Before the episodes, because they may change the policy and the wrappers.
+        manifest = evaluation_manifest(self, policy, config, [name for name, _ in acting], dataset)
         runs: list[dict[str, Any]] = []
+        folder = None
         try:
             for name, actor in acting:
                 recording = None
@@ -771,7 +809,7 @@ class World:
             self._end_interactive_loop()
         if hasattr(policy, "plans"):
             policy.plans = json.loads(acting[0][1].take_plans())
-        return Metrics._of(self, config, runs, dataset)
+        return Metrics._of(manifest, runs, folder)
 
     def _callables(self, callables: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """The callables for the engine; an empty list for native environments, which do not need them."""
@@ -834,17 +872,6 @@ def _joined(seeds: Sequence[int]) -> int:
     return int.from_bytes(digest[:4], "little")
 
 
-def _name(policy: Any) -> str:
-    kind = getattr(policy, "type", None)
-    # A subclass that acts otherwise is not of the kind that it inherits.
-    stated = next((made for made in type(policy).__mro__ if "type" in vars(made)), None)
-    inherits = "type" not in getattr(policy, "__dict__", {}) and str(stated and stated.__module__).startswith(
-        "stable_worldmodel."
-    )
-    own = kind in (None, "", "base") or (inherits and is_overridden(policy, "get_action"))
-    return type(policy).__name__ if own else str(kind)
-
-
 def _check_storable(space: spaces.Space[Any]) -> None:
     """Checks that datasets can hold all actions of a space.
 
@@ -861,14 +888,6 @@ def _check_storable(space: spaces.Space[Any]) -> None:
             )
 
 
-def _recorded(policy: Any) -> str:
-    """The name of a policy, and of one of the engine its seed, which decides what is collected."""
-    own = hasattr(policy, "_actor") and not is_overridden(policy, "get_action")
-    seed = getattr(policy, "seed", None) if own else None
-    seeded = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
-    return f"{_name(policy)},seed={seed}" if seeded else _name(policy)
-
-
 def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any]]) -> Callable[[], Any]:
     """A reference to a policy, at whose end its actor leaves `actors`: an actor may hold a model of gigabytes."""
     key = id(policy)
@@ -881,6 +900,11 @@ def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any]]) ->
     return weakref.ref(policy, end)
 
 
+def _without_weights(policy: Any) -> str:
+    """The record of a policy without the hash of its torch modules."""
+    return re.sub(r",weights=torch-sha256-\w+", "", str(policy))
+
+
 def _without_states(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     """The options of many episodes, checked to contain no fixed state or goal state."""
     fixed = [name for name in ("state", "goal_state") if (options or {}).get(name) is not None]
@@ -889,6 +913,7 @@ def _without_states(options: Mapping[str, Any] | None) -> Mapping[str, Any] | No
     return options
 
 
-def _describe(variation: Mapping[str, Any]) -> str:
+def _describe(variation: Mapping[str, Any], wrappers: Sequence[str]) -> str:
+    """The name of a condition: its factors and wrappers."""
     pinned = [f"{key} = {value}" for key, value in variation["variation_values"].items()]
-    return ", ".join([*(variation["variation"] or []), *pinned]) or "in distribution"
+    return ", ".join([*(variation["variation"] or []), *pinned, *wrappers]) or "in distribution"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import os
 import sys
 import types
 from collections.abc import Callable, Mapping
@@ -52,11 +53,11 @@ def policy_name(policy: Any, world: World) -> str:
     Names of policies of the engine belong to these: a policy of the user that takes one is named by its class.
     """
     kind = getattr(policy, "type", None)
-    reserved = _RESERVED | _experts(world)
     made = type(policy)
     acts_otherwise = is_overridden(policy, "get_action")
     if not acts_otherwise and kind == _own_kind(policy):
         return str(kind)
+    reserved = _RESERVED | _experts(world.env_name)
     # A subclass that acts otherwise is not of the kind that it inherits.
     stated = next((base for base in made.__mro__ if "type" in vars(base)), None)
     inherits = "type" not in getattr(policy, "__dict__", {}) and is_of_package(stated)
@@ -179,8 +180,9 @@ def _content_hash(name: str) -> str:
     dataset = load_dataset(name)
     location = str(getattr(dataset, "path", name))
     root = Path(url2pathname(urlsplit(location).path) if location.startswith("file://") else location)
-    files = [root] if root.is_file() else sorted(path for path in root.rglob("*") if path.is_file())
-    state = tuple((str(path), found.st_size, found.st_mtime_ns) for path in files for found in (path.stat(),))
+    below = sorted(os.path.join(folder, file) for folder, _, files in os.walk(root) for file in files)
+    files = below or [str(root)] * root.is_file()
+    state = tuple((file, found.st_size, found.st_mtime_ns) for file in files for found in (os.stat(file),))
     known = _HASHES.get(str(root))
     if known is None or not state or known[0] != state:
         known = _HASHES[str(root)] = (state, str(inspect(dataset)["content_hash"]))
@@ -199,7 +201,7 @@ def _evaluated_policy(policy: Any, world: World, name: str) -> tuple[dict[str, A
     try:
         settings = policy_settings(policy, world)
         weights = weights_hash(policy)
-        models = {one["name"] for one in choice or ()} - _RESERVED - _experts(world)
+        models = {one["name"] for one in choice or ()} - _RESERVED - (_experts(world.env_name) if choice else set())
         choice = [{**one, "weights": _checkpoint_hash(one["name"])} if one["name"] in models else one for one in choice or ()]
     except Exception as error:
         settings = {"unrecorded": _reason(policy, error)}
@@ -316,9 +318,10 @@ def _is_expert(policy: Any) -> bool:
     return isinstance(policy, ExpertPolicy)
 
 
-def _experts(world: World) -> set[str]:
-    """The experts of the environment of a world."""
-    return set(_engine.Actor.experts(world.env_name)) if world.env_name.partition(",")[0] in _engine.envs() else set()
+@functools.lru_cache(64)
+def _experts(env_name: str) -> frozenset[str]:
+    """The experts of an environment, of which the zoo has some."""
+    return frozenset(_engine.Actor.experts(env_name) if env_name.partition(",")[0] in _engine.envs() else ())
 
 
 def _plays_checkpoint(policy: Any) -> bool:

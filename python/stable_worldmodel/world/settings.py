@@ -32,8 +32,10 @@ _SMALL = 8
 #: The most parts of a setting. Those that have more are not recorded.
 _MOST_PARTS = 10_000
 
-#: The most objects that are searched for torch modules.
-_MOST_OBJECTS = 100_000
+#: The most objects that are searched for torch modules, and the most entries of one container: the other transitions of a
+#: buffer are like its first ones.
+_MOST_OBJECTS = 20_000
+_MOST_ENTRIES = 1_000
 
 #: The longest text of a setting in the name of a policy or the record of a wrapper; longer ones are recorded by their hash.
 _LONGEST = 200
@@ -168,11 +170,11 @@ def _object(value: Any, inner: Callable[[Any], Any]) -> Any:
     if isinstance(value, os.PathLike):
         return inner(os.fspath(value))
     if torch is not None and isinstance(value, torch.nn.Module):
-        public = [{name: one for name, one in vars(part).items() if name[0] != "_"} for part in value.modules()]
-        for part in public:
-            # It says how the module is used now.
-            part.pop("training", None)
-        return {"class": qualified(type(value)), "parts": inner(public), "weights": modules_hash(value), "repr": repr(value)}
+        own = set(vars(torch.nn.Module()))
+        parts = [_settings(part, own, inner) for part in value.modules()]
+        # The functions in a module's text have their addresses there, and are among its parts.
+        text = re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
+        return {"class": qualified(type(value)), "parts": parts, "weights": modules_hash(value), "repr": text}
     attributes: Any = getattr(value, "__dict__", None)
     if attributes and not isinstance(value, types.ModuleType):
         # Spaces make their generator when they are first sampled.
@@ -182,6 +184,19 @@ def _object(value: Any, inner: Callable[[Any], Any]) -> Any:
     if re.search(r"\bat 0x[0-9a-fA-F]+", text):
         raise Unrecorded(f"{type(value).__name__} has no text that is equal in another process")
     return {"class": qualified(type(value)), "repr": text} if text else qualified(type(value))
+
+
+def _settings(module: Any, own: set[str], inner: Callable[[Any], Any]) -> dict[str, Any]:
+    """The attributes of a torch module without those of every module. Private ones that have no description are left out."""
+    found = {}
+    for name, value in vars(module).items():
+        if name not in own:
+            try:
+                found[name] = inner(value)
+            except Unrecorded:
+                if name[0] != "_":
+                    raise
+    return found
 
 
 def named(name: str, value: Any) -> Any:
@@ -275,7 +290,7 @@ def _modules(given: Any, torch: Any) -> Iterator[tuple[str, Any]]:
     leaves = (type, types.ModuleType, str, bytes, int, float, complex, type(None), np.generic, torch.Tensor)
     # The objects themselves, so that the id of a temporary one is not used twice.
     seen: dict[int, Any] = {}
-    waiting = [("", given)]
+    waiting = [*_of_classes(given, torch), ("", given)]
     while waiting:
         name, one = waiting.pop()
         # A `World` has a policy of its own.
@@ -288,10 +303,27 @@ def _modules(given: Any, torch: Any) -> Iterator[tuple[str, Any]]:
                 raise Unrecorded("a set holds torch modules, which have no order there; use a list")
             yield name, one
             continue
-        parts = [(f"{name}.{key}", part) for key, part in _parts(one) if not isinstance(part, leaves)]
+        parts = [(f"{name}.{key}", part) for key, part in _parts(one) if not isinstance(part, leaves) and not _is_data(part)]
         waiting += reversed(parts)
         if len(seen) + len(waiting) > _MOST_OBJECTS:
             raise Unrecorded(f"more than {_MOST_OBJECTS} objects to search for torch modules")
+
+
+def _of_classes(given: Any, torch: Any) -> Iterator[tuple[str, Any]]:
+    """The torch modules among the attributes of an object's classes, and the methods of these, which may hold others."""
+    for base in type(given).__mro__:
+        if str(base.__module__).split(".")[0] not in _KNOWN:
+            for name, value in sorted(vars(base).items()):
+                if isinstance(value, (types.FunctionType, torch.nn.Module)):
+                    yield f".{base.__qualname__}.{name}", value
+
+
+#: The packages whose classes hold no torch modules of a user.
+_KNOWN = {"abc", "builtins", "collections", "gymnasium", "stable_worldmodel", "torch", "typing"}
+
+
+def _is_data(given: Any) -> bool:
+    return isinstance(given, np.ndarray) and given.dtype != object
 
 
 #: The key of all parts of sets.
@@ -309,9 +341,10 @@ def _parts(given: Any) -> Iterator[tuple[Any, Any]]:
     elif isinstance(given, (dict, types.MappingProxyType)):
         # The texts of other keys may be long, or have an address in memory.
         are_texts = all(isinstance(key, str) for key in given)
-        yield from ((key, given[key]) for key in sorted(given)) if are_texts else enumerate(given.values())
+        entries = ((key, given[key]) for key in sorted(given)) if are_texts else enumerate(given.values())
+        yield from itertools.islice(entries, _MOST_ENTRIES)
     elif isinstance(given, (list, tuple, deque)):
-        yield from enumerate(given)
+        yield from itertools.islice(enumerate(given), _MOST_ENTRIES)
     elif isinstance(given, (set, frozenset)):
         yield from ((_OF_SET, one) for one in given)
     elif isinstance(given, np.ndarray):

@@ -632,13 +632,13 @@ class World:
             first = foreign_episodes(path, format, mode)
             writer = foreign_writer(path, format, mode)
         is_stored = writer is None
-        begun = stored_policy(str(path), format) if is_stored and mode == "append" else ""
+        begun = stored_policy(str(path), format) if is_stored and mode in ("append", "resume") else ""
         # A policy of the user may learn between collections: its weights are compared if the dataset was begun with them.
-        learns = mode == "append" and is_overridden(policy, "get_action") and ",weights=" not in begun
+        learns = (mode == "append" or bool(begun)) and is_overridden(policy, "get_action") and ",weights=" not in begun
         recorded, problem = collected_policy(policy, self, is_stored=is_stored, with_weights=not learns)
         if begun and recorded != begun and _without_weights(recorded) == _without_weights(begun):
             raise ValueError(
-                f"World.collect: mode='append': the dataset records policy {begun}, and this is policy {recorded}; they "
+                f"World.collect: mode={mode!r}: the dataset records policy {begun}, and this is policy {recorded}; they "
                 "differ in their weights; for a policy that learns, take a class of your own with get_action and begin the "
                 "dataset with mode='append' as well, which records no weights of it, or collect into another dataset"
             )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .. import _engine
 
-__all__ = ["home_of", "is_module", "is_stored", "located"]
+__all__ = ["folder_of", "home_of", "is_module", "is_stored", "located"]
 
 
 def home_of(cache_dir: str | os.PathLike[str] | None) -> Path:
@@ -15,11 +15,15 @@ def home_of(cache_dir: str | os.PathLike[str] | None) -> Path:
     return Path(_engine.home() if cache_dir is None else os.path.expanduser(cache_dir))
 
 
+def folder_of(path: Path) -> Path | None:
+    """The folder with the weights of a checkpoint of the engine: a run's own, or `checkpoint` in it."""
+    folders = (path / name for name in ("", *_engine.CHECKPOINT_FOLDERS))
+    return next((folder for folder in folders if (folder / "weights.safetensors").is_file()), None)
+
+
 def is_stored(path: Path) -> bool:
     """Whether a checkpoint of the engine is at a path: a run, the folder `checkpoint` in it, or a capsule."""
-    if path.is_file():
-        return path.suffix == ".safetensors"
-    return any((path / name / "weights.safetensors").is_file() for name in ("", *_engine.CHECKPOINT_FOLDERS))
+    return path.suffix == ".safetensors" if path.is_file() else folder_of(path) is not None
 
 
 def is_module(path: Path) -> bool:

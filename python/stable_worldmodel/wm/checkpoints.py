@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from .. import _engine
+from ._located import folder_of
 from ._weights import load_into, read_capsule, read_safetensors
 from .encoders import encoder_of
 from .frames import Frames
@@ -85,12 +86,6 @@ def check_kind(family: str, kind: type[Pretrained] | None) -> None:
         raise TypeError(f"a model of the family {family!r} is a {name}, not a {kind.__name__}; derive the class from {name}")
 
 
-def _folder_of(path: Path) -> Path | None:
-    """The folder of a run that holds the checkpoint."""
-    folders = (path, *(path / name for name in _engine.CHECKPOINT_FOLDERS))
-    return next((folder for folder in folders if (folder / "weights.safetensors").is_file()), None)
-
-
 def _parts(path: Path) -> tuple[Stored, dict[str, Tensor]] | None:
     """The parts of a checkpoint; `None` if there is none at the path."""
     if path.is_file():
@@ -98,7 +93,7 @@ def _parts(path: Path) -> tuple[Stored, dict[str, Tensor]] | None:
             return None
         document, weights = read_capsule(path)
         return Stored(document["checkpoint"], document["manifest"]), weights
-    folder = _folder_of(path)
+    folder = folder_of(path)
     if folder is None:
         return None
     manifest = folder / "manifest.json"

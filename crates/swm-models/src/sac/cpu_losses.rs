@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use std::f32::consts::{LN_2, TAU};
 use std::ops::Range;
 use std::sync::LazyLock;
-use swm_kernels::{BLOCK, ReluLayer, ReluNetwork, ReluScratch, ReluTape, ScratchPool, write_blocks};
+use swm_kernels::{BLOCK, ReluLayer, ReluNetwork, ReluScratch, ReluTape, ScratchPool, functions, write_blocks};
 
 /// The number of transitions in a part.
 const PART: usize = 4 * BLOCK;
@@ -283,11 +283,10 @@ fn lanes_mut(values: &mut [f32]) -> &mut [Lane] {
 
 /// Adds the gradients of all parts.
 fn sum(parts: Vec<Vec<ReluLayer>>) -> Vec<ReluLayer> {
-    let add = |sum: &mut [f32], terms: &[f32]| sum.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
     let added = parts.into_iter().reduce(|mut sums, terms| {
         for (sum, term) in sums.iter_mut().zip(&terms) {
-            add(&mut sum.weight, &term.weight);
-            add(&mut sum.bias, &term.bias);
+            functions::add(&mut sum.weight, &term.weight);
+            functions::add(&mut sum.bias, &term.bias);
         }
         sums
     });

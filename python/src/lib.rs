@@ -48,7 +48,8 @@ mod _engine {
     use super::data::replay::{ReplayBuffer, ReplaySampler};
     #[pymodule_export]
     use super::data::tools::{
-        check_replacement, convert, detect, doctor, find_dataset, has_no_dataset, inspect, recover, target,
+        check_replacement, convert, detect, doctor, find_dataset, has_no_dataset, inspect, pinned_dataset, recover,
+        target, warning_of_starts,
     };
     #[pymodule_export]
     use super::data::writer::Writer;

@@ -8,16 +8,17 @@ use pyo3::types::PyDict;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
-use swm::core::{Batch, Candidates, CostModel, Error, Key, Origin, Policy, Schema};
+use swm::core::{Batch, Candidates, CostModel, Error, Key, Origin, Policy, Result, Schema};
 use swm::models::Device;
-use swm::models::{CheckpointInfo, load};
+use swm::models::{CheckpointInfo, FAMILIES, LoadedModel, StoredCheckpoint, load_stored};
 use swm::plan::ActionScale;
 use swm::plan::objective::ObjectiveConfig;
 
-/// A checkpoint, which is loaded when a cost or an action is first needed.
+/// A checkpoint. Its weights stay in memory, so that those that are loaded also play.
 #[pyclass(frozen, subclass, module = "stable_worldmodel._engine")]
 pub struct Model {
     path: PathBuf,
+    stored: StoredCheckpoint,
     device: Device,
     objective: Value,
     scale: ActionScale,
@@ -36,12 +37,20 @@ pub struct Model {
 }
 
 impl Model {
+    /// Creates the model.
+    ///
+    /// # Errors
+    /// If the device has no memory for it.
+    pub fn load(&self) -> Result<Box<dyn LoadedModel>> {
+        load_stored(FAMILIES.rows, &self.stored, &self.device)
+    }
+
     /// Creates a cost model and returns it with the scale of its actions.
     ///
     /// # Errors
-    /// If the checkpoint cannot be loaded, holds a policy without a cost, or the objective is not valid.
+    /// If the model cannot be created, holds a policy without a cost, or the objective is not valid.
     pub fn cost_model(&self) -> PyResult<(Box<dyn CostModel>, ActionScale)> {
-        let loaded = load(&self.path, &self.device).map_err(to_py_err)?;
+        let loaded = self.load().map_err(to_py_err)?;
         let cost = loaded.cost().ok_or_else(|| {
             let what = format!("checkpoint {}", self.path.display());
             to_py_err(Error::config(what, "it acts and does not predict", "use it as a policy: FeedForwardPolicy"))
@@ -62,10 +71,11 @@ impl Model {
         let objective: Value = json("objective", objective)?;
         let found = exit::detached(py, || {
             let path = swm::home::find_checkpoint(name)?;
-            let info = load(&path, &device)?.info()?;
-            Ok((path, info))
+            let stored = StoredCheckpoint::read(&path)?.in_memory()?;
+            let info = load_stored(FAMILIES.rows, &stored, &device)?.info()?;
+            Ok((path, stored, info))
         });
-        let (path, info) = found.map_err(to_py_err)?;
+        let (path, stored, info) = found.map_err(to_py_err)?;
         let CheckpointInfo { family, weights, config, dataset_info, image_size, action_block, history, .. } = &info;
         let described = json!({
             "family": family,
@@ -81,6 +91,7 @@ impl Model {
         Ok(Self {
             origin: Origin::file(&path, trust),
             path,
+            stored,
             device,
             objective,
             scale: info.dataset_info.action.clone(),
@@ -99,8 +110,8 @@ impl Model {
     }
 
     /// The path of the checkpoint.
-    #[getter]
-    fn path(&self) -> String {
+    #[getter(path)]
+    pub fn name(&self) -> String {
         self.path.display().to_string()
     }
 
@@ -120,7 +131,7 @@ impl Model {
             };
             let spec = swm::env(id, &self.origin)?.env()?.spec().clone();
             if cached.as_ref().is_none_or(|(_, slots)| *slots != rows) {
-                let policy = load(&self.path, &self.device)?.policy(&spec, rows).ok_or_else(|| {
+                let policy = self.load()?.policy(&spec, rows).ok_or_else(|| {
                     Error::config(what(), "it predicts and does not act", "plan with it: get_cost, MPCPolicy")
                 })??;
                 *cached = Some((policy, rows));

@@ -4,6 +4,7 @@ use crate::cost::planning_model;
 use crate::errors::{attached, json, to_py_err};
 use crate::exit;
 use crate::held::Held;
+use crate::model::Model;
 use crate::observer::PythonObserver;
 use crate::world::World;
 use crate::{arrays, solver};
@@ -16,6 +17,9 @@ use swm::core::run::Interrupt;
 use swm::core::{Batch, EnvPool, Key, Named as _, Policy, RandomPolicy, Result};
 use swm::eval::PolicyChoice;
 use swm::plan::{ActionScale, MpcConfig, MpcPolicy, TraceLog};
+
+/// The name under which a manifest has the hash of a policy's weights.
+const POLICY: &str = "policy";
 
 /// A policy for the environments of one world.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -59,6 +63,12 @@ impl Actor {
         Ok(Self { hashes: hash_of(weights), ..Self::new(policy, seed) })
     }
 
+    /// The hash of the weights of the checkpoint that acts or plans; `None` for other policies.
+    #[getter]
+    fn weights(&self) -> Option<&str> {
+        self.hashes.get(POLICY).map(String::as_str)
+    }
+
     /// Creates the policy of a checkpoint.
     #[staticmethod]
     fn checkpoint(py: Python<'_>, world: &World, name: &str) -> PyResult<Self> {
@@ -66,6 +76,16 @@ impl Actor {
         let (spec, slots) = (world.spec().clone(), world.pool().len());
         let (policy, info) =
             exit::detached(py, || swm::resolver::checkpoint_policy(name, &spec, slots)).map_err(to_py_err)?;
+        Ok(Self { hashes: hash_of(Some(info.weights)), ..Self::new(policy, None) })
+    }
+
+    /// Creates the policy of a loaded checkpoint.
+    #[staticmethod]
+    fn model(py: Python<'_>, world: &World, model: &Model) -> PyResult<Self> {
+        let world = world.lock()?;
+        let (spec, slots) = (world.spec().clone(), world.pool().len());
+        let made = exit::detached(py, || swm::resolver::direct(&*model.load()?, &model.name(), &spec, slots));
+        let (policy, info) = made.map_err(to_py_err)?;
         Ok(Self { hashes: hash_of(Some(info.weights)), ..Self::new(policy, None) })
     }
 
@@ -150,7 +170,7 @@ impl Actor {
 
 /// Returns the hashes of a policy with these weights.
 fn hash_of(weights: Option<String>) -> BTreeMap<String, String> {
-    weights.map(|weights| ("policy".to_owned(), weights)).into_iter().collect()
+    weights.map(|weights| (POLICY.to_owned(), weights)).into_iter().collect()
 }
 
 /// A policy whose random stream depends on a seed in addition to the episode's key.

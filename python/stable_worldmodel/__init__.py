@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from . import (
         ray as ray,
     )
+    from . import (
+        train as train,
+    )
     from .policy import PlanConfig
     from .world import Metrics, World
 
@@ -63,8 +66,8 @@ __all__ = [
     "wrapper",
 ]
 
-#: Modules that `import *` leaves out, because they need packages that few have.
-_OPTIONAL = ("ray",)
+#: Modules that `import *` leaves out, because they need packages that not everybody has.
+_OPTIONAL = ("ray", "train")
 #: The modules that define the exported classes.
 _MODULES = {"World": "world", "Metrics": "world", "PlanConfig": "policy"}
 

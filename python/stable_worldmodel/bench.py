@@ -211,6 +211,12 @@ def main(arguments: list[str] | None = None) -> None:
     sizes = _words(parser, "--sizes", given.sizes or default, None)
     if given.repeats < 1:
         parser.error(f"--repeats {given.repeats}: expected at least 1")
+    try:
+        torch.empty(1, device=given.device).cpu()
+    except (RuntimeError, NotImplementedError, AssertionError) as error:
+        parser.error(
+            f"--device {given.device}: {str(error).splitlines()[0]}; expected a device of torch, such as cpu or cuda:0"
+        )
     bench = Bench(given.device, given.repeats)
     for size in map(int, sizes):
         for precision in precisions:

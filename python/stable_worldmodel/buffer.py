@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from . import _options
+
 __all__ = ["HistoryBuffer"]
 
 
@@ -27,10 +29,10 @@ class HistoryBuffer:
     """
 
     def __init__(self, n_envs: int, max_len: int, action_block: int = 1, block_keys: Iterable[str] = ()) -> None:
-        for name, value in (("n_envs", n_envs), ("max_len", max_len), ("action_block", action_block)):
-            if int(value) < 1:
-                raise ValueError(f"HistoryBuffer: {name}={value}; expected at least 1")
-        self.n_envs, self.max_len, self.action_block = int(n_envs), int(max_len), int(action_block)
+        sizes = {"n_envs": n_envs, "max_len": max_len, "action_block": action_block}
+        self.n_envs, self.max_len, self.action_block = (
+            _options.count(f"HistoryBuffer: {name}", value) for name, value in sizes.items()
+        )
         self.block_keys = frozenset(block_keys)
         self._steps: list[deque[dict[str, Any]]] = [deque(maxlen=self.max_len) for _ in range(self.n_envs)]
 

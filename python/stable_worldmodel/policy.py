@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,8 +93,27 @@ def _seconds(name: str, value: Any) -> float:
     return seconds
 
 
+def _misspelt(name: str, kind: type[Any]) -> str | None:
+    """The parameter of a class of this package that a keyword probably means."""
+    if hasattr(kind, name) or not kind.__module__.startswith("stable_worldmodel."):
+        return None
+    import difflib
+    import inspect
+
+    parameters = inspect.signature(kind).parameters.values()
+    known = [parameter.name for parameter in parameters if parameter.kind is not inspect.Parameter.VAR_KEYWORD]
+    return next(iter(difflib.get_close_matches(name, known, 1, 0.75)), None)
+
+
 class BasePolicy:
-    """Base class of policies."""
+    """Base class of policies.
+
+    Args:
+        **kwargs: Attributes of the policy.
+
+    Raises:
+        TypeError: If a keyword is a misspelt parameter of a class of this package.
+    """
 
     #: The kind of the policy, for manifests and results; the name of the class for `"base"`, and for the name of a policy of
     #: the engine, such as `"random"`.
@@ -103,6 +122,8 @@ class BasePolicy:
     def __init__(self, **kwargs: Any) -> None:
         self.env: Any = None
         for name, value in kwargs.items():
+            if meant := _misspelt(name, type(self)):
+                raise TypeError(f"{type(self).__name__}: unknown argument {name!r}; did you mean {meant!r}?")
             setattr(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -127,6 +148,9 @@ Policy = BasePolicy
 
 class _EnginePolicy(BasePolicy):
     """A policy that acts inside the engine."""
+
+    #: How often its settings changed: worlds make a new actor then.
+    _changes = 0
 
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
         """The actions for the current infos of the world; `obs` is ignored."""
@@ -156,7 +180,8 @@ class RandomPolicy(_EnginePolicy):
             env.action_space.seed(self.seed)
 
     def set_seed(self, seed: int) -> None:
-        """Sets the policy's seed."""
+        """Sets the policy's seed, in every world that it acts in."""
+        self._changes += seed != self.seed
         self.seed = seed
         if self._is_in_world():
             self.env._world._drop_actor(self)
@@ -209,7 +234,7 @@ class MixturePolicy(_EnginePolicy):
         weights: The weight of each policy by name: `"random"`, `"expert"`, another expert, or a checkpoint that acts without
             a solver. A policy plays a share of the episodes that is its weight divided by the sum of all weights.
 
-    The column `policy_index` of a collected dataset holds the index of the episode's policy in `weights`.
+    The column `policy_index` of a dataset that several policies collected holds the index of the episode's policy in `weights`.
     """
 
     type = "mixture"
@@ -267,14 +292,16 @@ class FeedForwardPolicy(BasePolicy):
         if hasattr(model, "eval") and not isinstance(model, str):
             model.eval()
 
-    def _checkpoint(self) -> str | None:
-        """The name or path of the checkpoint that acts; `None` for a model in Python."""
+    def _checkpoint(self) -> Any:
+        """The name or path of the checkpoint that acts, or the engine's model; `None` for a model in Python."""
         return self.model if isinstance(self.model, str) else engine_part(self.model, "_engine_policy", "get_action")
 
     def _actor(self, world: World) -> Any:
-        name = self._checkpoint()
-        # Transforms of frames are functions in Python, so the checkpoint is called from here.
-        return None if name is None or world.transforms else _engine.Actor.checkpoint(world._world, name)
+        model = self._checkpoint()
+        if model is None or world.transforms:
+            # Transforms of frames are functions in Python, so the checkpoint is called from here.
+            return None
+        return (_engine.Actor.checkpoint if isinstance(model, str) else _engine.Actor.model)(world._world, model)
 
     def get_action(self, info_dict: Any, **kwargs: Any) -> Any:  # type: ignore[override]
         """The actions `(num_envs, ..)` for infos `(num_envs, T, ..)`."""
@@ -420,7 +447,8 @@ class MPCPolicy(BasePolicy):
         if scale is None and scaler is not None:
             return None
         model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
-        cfg = asdict(self.cfg)
+        # A class derived from PlanConfig can have fields of its own.
+        cfg = {field.name: getattr(self.cfg, field.name) for field in fields(PlanConfig)}
         cfg["history"] = cfg.pop("history_len")
         settings = json.dumps(self.solver.settings)
         seed, observer = self.solver.seed, self.solver._observer() if self.solver.callbacks else None

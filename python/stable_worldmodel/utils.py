@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import _engine, _files
+from . import _engine, _files, _options
 
 __all__ = [
     "DEFAULT_CACHE_DIR",
@@ -113,6 +113,7 @@ def record_video_from_dataset(
 
     Raises:
         ValueError: If the folder is a URI, or the dataset does not have a column.
+        IndexError: If the dataset does not have an episode.
     """
     import numpy as np
 
@@ -124,7 +125,12 @@ def record_video_from_dataset(
     missing = [view for view in views if view not in dataset.column_names]
     if missing:
         raise ValueError(f"viewname: the dataset has no {missing}; its columns are {list(dataset.column_names)}")
-    for episode in [episode_idx] if isinstance(episode_idx, int) else list(episode_idx):
+    total = len(dataset.lengths)
+    for given in episode_idx if isinstance(episode_idx, Iterable) else [episode_idx]:
+        episode = _options.whole("episode_idx", given)
+        if not -total <= episode < total:
+            raise IndexError(f"episode_idx: {episode}; the dataset has {total} episodes")
+        episode %= total
         columns = dataset.load_episode(episode)
         parts = [np.moveaxis(to_numpy(columns[view])[:max_steps], 1, -1) for view in views]
         frames = list(np.concatenate(parts, axis=2))

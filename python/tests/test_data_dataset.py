@@ -47,6 +47,15 @@ def test_dataset_reports_its_columns_and_lengths(stored):
     assert "4 episodes, 71 rows" in repr(dataset)
 
 
+def test_clips_are_counted_in_whole_numbers_and_columns_are_lists(stored):
+    path, _, _ = stored
+    for given in ({"num_steps": 1.5}, {"num_steps": "4"}, {"frameskip": None}, {"frameskip": 0}):
+        with pytest.raises(ValueError, match=f"{next(iter(given))}: .*; expected a whole number of at least 1"):
+            data.load_dataset(path, **given)
+    with pytest.raises(TypeError, match="keys_to_load: 'action'; expected a list of columns"):
+        data.load_dataset(path, keys_to_load="action")
+
+
 def test_chunks_episodes_columns_and_rows_equal_the_written_data(stored):
     path, written, lists = stored
     dataset = data.load_dataset(path, num_steps=2, frameskip=3, backend="numpy")
@@ -54,6 +63,7 @@ def test_chunks_episodes_columns_and_rows_equal_the_written_data(stored):
     for chunk, (number, start, end) in zip(chunks, [(3, 2, 14), (0, 0, 6)], strict=True):
         expected = clips([{name: array[start:end] for name, array in written[number].items()}], (end - start) // 3, 3)
         same(chunk, expected[0], lists)
+    assert dataset.load_chunk([1], [3], [3])[0]["action"].shape == (0, 6)
     loaded = dataset.load_episode(2)
     assert loaded["action"].shape == (9, 2) and loaded["state"].shape == (3, 4)
     for name in ("pixels", "action", "state"):
@@ -143,8 +153,6 @@ def test_wrong_arguments_raise_errors_with_the_reason(stored, tmp_path, monkeypa
         dataset.load_chunk([0], [5], [13])
     with pytest.raises(IndexError, match="episode 4 is outside the dataset, which has 4 episodes"):
         dataset.load_chunk([4], [0], [1])
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        data.load_dataset(path, frameskip=0)
     with pytest.raises(ValueError, match="'torch' or 'numpy', got 'jax'"):
         data.load_dataset(path, backend="jax")
     with pytest.raises(ValueError, match="unknown format 'zarr'"):
@@ -417,3 +425,17 @@ def test_text_columns_become_constants(tmp_path):
     dataset = data.load_dataset(tmp_path / "a.lance")
     assert dataset.constants(0) == {"scene": b"<mujoco/>", "words": b"go"}
     assert "words" not in dataset.column_names
+
+
+def test_columns_that_only_some_joined_datasets_have_are_counted_with_a_warning(tmp_path):
+    for name, more in (("a.h5", {}), ("b.h5", {"z": np.arange(3.0)})):
+        with data.open_writer(tmp_path / name) as writer:
+            writer.write_episode({"x": np.arange(3.0), **more})
+    joined = data.ConcatDataset([data.load_dataset(tmp_path / name, backend="numpy") for name in ("a.h5", "b.h5")])
+    assert joined.get_col_data("x").tolist() == [0, 1, 2, 0, 1, 2]
+    with pytest.warns(UserWarning, match="1 of 2 datasets have column 'z'"):
+        assert joined.get_col_data("z").tolist() == [0, 1, 2]
+    assert joined.get_row_data([3, 4])["z"].tolist() == [0, 1]
+    for rows in ([0, 3], [3, 0]):
+        with pytest.raises(KeyError, match="some rows have other columns"):
+            joined.get_row_data(rows)

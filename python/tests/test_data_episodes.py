@@ -76,6 +76,23 @@ def test_episodes_are_named_by_whole_numbers(tmp_path):
         swm.data.GoalDataset(dataset, current_goal_offset=1.5)
 
 
+def test_current_steps_lie_in_the_episode_and_unknown_goal_columns_are_named(tmp_path):
+    dataset = swm.data.load_dataset(written(tmp_path / "a.lance"), backend="numpy")
+    # The current step is the third one from a clip's start: episodes of four rows have two such clips.
+    current = {"goal_probabilities": (0, 0, 0, 1), "goal_keys": {"x": "goal_x"}}
+    goals = swm.data.GoalDataset(dataset, current_goal_offset=3, **current)
+    assert [float(sample["goal_x"].item()) for sample in goals] == [2, 3, 12, 13, 22, 23]
+    with pytest.warns(UserWarning, match="replace the dataset's columns \\['pixels'\\]"):
+        swm.data.GoalDataset(dataset, goal_keys={"x": "pixels"}, goal_probabilities=(1, 0, 0, 0))
+    for anchor in (-1, 0.5):
+        with pytest.raises(ValueError, match="Goals.anchor: .*; expected a whole number of at least 0"):
+            swm.data.Loader(dataset, 2, goals=swm.data.Goals(columns=["x"], anchor=anchor))
+    with pytest.raises(ValueError, match="the anchor of 'goal'.*7"):
+        swm.data.Loader(dataset, 2, goals=swm.data.Goals(columns=["x"], anchor=7))
+    with pytest.warns(UserWarning, match="no \\['y'\\]"):
+        assert "goal_y" not in swm.data.GoalDataset(dataset, goal_keys={"y": "goal_y"}, goal_probabilities=(1, 0, 0, 0))[0]
+
+
 @pytest.mark.parametrize(
     "item",
     [
@@ -144,6 +161,19 @@ def test_videos_of_episodes(tmp_path):
     assert (tmp_path / "panels" / "env_0.mp4").stat().st_size > 1000
     with pytest.raises(ValueError, match="uint8"):
         swm.plot.save_video(tmp_path / "bad.mp4", frames.astype(np.float32))
+    with pytest.raises(ValueError, match="videos are MP4 files"):
+        swm.plot.save_video(tmp_path / "bad.gif", frames)
+    for fps in (0, -5, np.nan):
+        with pytest.raises(ValueError, match="fps: .*; expected"):
+            swm.plot.save_video(tmp_path / "bad.mp4", frames, fps=fps)
+    for panels in ({}, {"a": [frames], "b": [frames, frames]}):
+        with pytest.raises(ValueError, match="panels: they have the environments .*; give at least one"):
+            swm.plot.save_panel_videos(tmp_path / "panels", panels)
+    dataset = swm.data.load_dataset(written(tmp_path / "v.lance"))
+    swm.utils.record_video_from_dataset(tmp_path / "recorded", dataset, np.int64(-1))
+    assert [path.name for path in (tmp_path / "recorded").iterdir()] == ["episode_2.mp4"]
+    with pytest.raises(IndexError, match="episode_idx: 3; the dataset has 3 episodes"):
+        swm.utils.record_video_from_dataset(tmp_path / "recorded", dataset, [0, 3])
     with pytest.raises(ValueError, match="nothing"):
         swm.utils.record_video_from_dataset(tmp_path, dataset, 0, viewname="nothing")
 

@@ -121,6 +121,12 @@ def test_saved_position_continues_with_the_same_batches(stored):
     assert identities(stopped) == epochs[1]
     with pytest.raises(ValueError, match="seed was 5 and is 6"):
         loader(path, seed=6).load_state_dict(complete.state_dict())
+    with pytest.raises(ValueError, match="shuffle was 1 and is 0"):
+        loader(path, seed=5, shuffle=False).load_state_dict(complete.state_dict())
+    steps, skip = complete.num_steps, complete.frameskip
+    other = loader(path, seed=5, num_steps=1, frameskip=steps * skip)
+    with pytest.raises(ValueError, match=f"num_steps was {steps} and is 1"):
+        other.load_state_dict({**complete.state_dict(), "clips": other.num_clips})
     for other in ({}, None):
         with pytest.raises(ValueError, match="expected what state_dict returned"):
             complete.load_state_dict(other)

@@ -140,6 +140,17 @@ def test_missing_actions_are_not_invented(tmp_path, dtype):
     assert data.load_dataset(path).get_col_data("action").ravel().tolist() == [1, 1, 1, 1]
 
 
+@pytest.mark.parametrize("format", ["lance", "hdf5", "folder", "lerobot"])
+@pytest.mark.parametrize(
+    "actions", [np.array([5, 6, 7, 8], np.uint8), np.array([True, True, True, False]), np.array([9], np.uint8)]
+)
+def test_last_actions_of_types_without_a_missing_value_are_kept(tmp_path, format, actions):
+    content = {"x": np.arange(len(actions), dtype=np.float32), "action": actions}
+    with pytest.warns(UserWarning, match="is stored"), data.open_writer(tmp_path / "a", format=format) as writer:
+        writer.write_episode(content)
+    assert data.load_dataset(tmp_path / "a", format=format).get_col_data("action").ravel().tolist() == actions.tolist()
+
+
 @pytest.mark.parametrize("mode", ["append", "overwrite"])
 @pytest.mark.parametrize("name", ["a.lance", "a.h5", "a"])
 def test_threads_share_a_writer(tmp_path, name, mode):
@@ -227,6 +238,8 @@ def test_invalid_episodes_are_rejected_and_valid_ones_stored(tmp_path):
     assert data.load_dataset(path).num_episodes == 3
     with pytest.raises(ValueError, match="unexpected"), data.open_writer(path) as writer:
         writer.write_episode({**valid, "other": np.zeros(5)})
+    with pytest.raises(ValueError, match="column 'step_idx': its values would be lost"), data.open_writer(path) as writer:
+        writer.write_episode({**valid, "step_idx": np.arange(5) + 0.5})
 
 
 def test_lossless_codecs_are_exact(tmp_path):
@@ -244,6 +257,19 @@ def test_lossless_codecs_are_exact(tmp_path):
         with pytest.raises(ValueError, match="codec: expected"):
             data.open_writer(tmp_path / "b.lance", codec=wrong)
     assert data.LanceWriter(tmp_path / "c.lance", jpeg_quality=80).format == "lance"
+
+
+def test_formats_without_codecs_refuse_jpeg(tmp_path):
+    write(tmp_path / "a.lance", (6,))
+    world = swm.World("swm/TwoRoom-v1", num_envs=1, image_shape=(32, 32), max_episode_steps=2)
+    for call in (
+        lambda codec: write(tmp_path / "b.h5", (6,), codec=codec),
+        lambda codec: data.convert(tmp_path / "a.lance", tmp_path / "c.h5", codec=codec, progress=False),
+        lambda codec: world.collect(tmp_path / "d.h5", 1, policy=swm.policy.RandomPolicy(), codec=codec, progress=False),
+    ):
+        with pytest.raises(ValueError, match="the format hdf5 stores images without loss; leave it out"):
+            call("jpeg-90")
+        call("png")
 
 
 @pytest.fixture
@@ -383,6 +409,9 @@ def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, m
     def unreadable(path, **kwargs):
         raise NotImplementedError("the format cannot be read")
 
+    # The user's writer would add to the folder, whatever the mode.
+    with pytest.raises(FileExistsError, match="there is a dataset already; continue it"):
+        collected(tmp_path / "a.npzs", "error", 1)
     monkeypatch.setattr(numpy_format, "open_reader", unreadable)
     with pytest.raises(ValueError, match="does not tell the number of episodes .the format cannot be read., .*cannot resume"):
         collected(tmp_path / "a.npzs", "resume", 9)

@@ -60,7 +60,7 @@ def test_steps_are_copied_and_tensors_stay_tensors():
 
 
 def test_wrong_sizes_are_named():
-    with pytest.raises(ValueError, match="action_block=0"):
+    with pytest.raises(ValueError, match="HistoryBuffer: action_block: 0; expected a whole number of at least 1"):
         HistoryBuffer(1, 3, action_block=0)
     with pytest.raises(ValueError, match=r"'x' has shape \(3,\), expected \(2, \.\.\)"):
         HistoryBuffer(2, 3).append({"x": np.zeros(3)})

@@ -1,5 +1,6 @@
 """Tests of objectives, evaluators and callbacks of solvers."""
 
+import dataclasses
 import json
 from concurrent.futures import ThreadPoolExecutor
 
@@ -397,3 +398,32 @@ def test_complex_costs_of_a_model_with_complex_parameters_are_refused():
 
     with pytest.raises(ValueError, match="expected real costs, got torch.complex64"):
         configured(planning.CEMSolver(Complex(), num_samples=8, n_steps=2, topk=3)).solve(infos())
+
+
+def test_solvers_name_what_they_cannot_plan_with():
+    class Plain:
+        def get_cost(self, infos, candidates):
+            return candidates.square().sum((-1, -2))
+
+    for seed in (-1, 1.5, "a"):
+        with pytest.raises(ValueError, match="seed: .*; expected a whole number of at least 0"):
+            swm.solver.CEMSolver("simulator", seed=seed)
+    solver = swm.solver.CEMSolver(Plain(), num_samples=8, n_steps=1, topk=2)
+    solver.configure(action_space=BOX, n_envs=3, config=swm.PlanConfig(horizon=2, receding_horizon=1))
+    for infos, error in (({}, ValueError), ({"words": ["a"]}, ValueError), ([], TypeError)):
+        with pytest.raises(error, match="info_dict: .*expected"):
+            solver.solve(infos)
+    solver.configure(action_space=gymnasium.spaces.MultiBinary(3), n_envs=1, config=swm.PlanConfig(2, 1))
+    with pytest.raises(TypeError, match=r"MultiBinary\(3\); planners choose actions of Box"):
+        solver.solve({"state": np.zeros((1, 1, 2), np.float32)})
+
+
+def test_plan_configurations_with_fields_of_their_own_plan():
+    @dataclasses.dataclass(frozen=True)
+    class Named(swm.PlanConfig):
+        name: str = "short"
+
+    solver = swm.solver.CEMSolver("simulator", num_samples=8, n_steps=1, topk=2)
+    world = swm.World("swm/TwoRoom-v1", 1, add_pixels=False, max_episode_steps=3)
+    policy = swm.policy.MPCPolicy(solver, Named(horizon=2, receding_horizon=1))
+    assert world.evaluate(policy=policy, episodes=1, seed=0, progress=False)["steps"].tolist() == [3]

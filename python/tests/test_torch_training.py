@@ -525,6 +525,12 @@ def test_a_class_of_another_family_is_refused_before_anything_is_written(rooms, 
     assert not (tmp_path / "run").exists()
 
 
+def test_a_batch_that_the_data_do_not_fill_is_refused_before_anything_is_written(rooms, tmp_path):
+    with pytest.raises(ValueError, match="clips do not fill one batch of 100000"):
+        torch_train("lewm", rooms, tmp_path / "run", ["data.batch_size=100000", *SHORT[1:]])
+    assert not (tmp_path / "run/checkpoint").exists()
+
+
 def test_a_gradient_of_infinite_norm_ends_the_training(rooms, tmp_path):
     settings = [*SHORT, "loss.weight=1e30"]
     with pytest.raises(FloatingPointError, match="norm of the gradient at training step 1 is inf.*optim.lr or the weights"):
@@ -544,7 +550,10 @@ def test_hydra_runs_several_trainings(rooms, tmp_path):
         "seed=1",
         f"hydra.sweep.dir={tmp_path / 'sweep'}",
     ]
-    child = command("lewm", f"data={rooms}", "preset=tiny", "device=cpu", *SHORT, *sweep, cwd=tmp_path)
+    # Hydra would read the name as a number.
+    (tmp_path / "home/datasets").mkdir(parents=True)
+    shutil.copytree(rooms, tmp_path / "home/datasets/2026_11_29.lance")
+    child = command("lewm", "data=2026_11_29", "preset=tiny", "device=cpu", *SHORT, *sweep, cwd=tmp_path)
     printed, errors = child.communicate(timeout=300)
     assert child.returncode == 0, errors
     for job, latent in enumerate((3, 4)):

@@ -514,16 +514,26 @@ def test_indices_of_no_environment_are_refused(index):
         (lambda: rooms(num_envs=0), ValueError, "num_envs"),
         (lambda: rooms(image_shape=(0, 8)), ValueError, "image_shape: 0; expected a whole number of at least 1"),
         (lambda: rooms().step(), RuntimeError, "set_policy"),
-        (lambda: rooms().reset(seed=-1), ValueError, "from 0"),
+        (lambda: rooms().reset(seed=-1), ValueError, "seed: -1; expected a whole number of at least 0"),
+        (lambda: rooms().reset(seed="x"), ValueError, "seed: 'x'; expected a whole number"),
         (lambda: rooms().reset(seed=[1, 2]), ValueError, "expected 3 seeds.*got 2"),
         (lambda: rooms(image_shape=64), TypeError, "height, width"),
         (lambda: rooms().set_policy(3), TypeError, "get_action"),
         (lambda: rooms().set_policy(Zero), TypeError, "class"),
         (lambda: rooms().collect("x", episodes=1, policy=Zero(), codec="gif"), ValueError, "jpeg-QUALITY"),
         (lambda: rooms().evaluate(policy=Zero(), episodes=0), ValueError, "at least 1"),
+        (lambda: rooms().evaluate(policy=Zero(), videos=1), ValueError, "videos: no folder is named; pass video"),
+        (
+            lambda: rooms(add_pixels=False).collect("x", 1, policy=Zero(), goal=True),
+            ValueError,
+            "goal: the world has no frames",
+        ),
+        (lambda: rooms().collect(writer=[], episodes=1, policy=Zero(), codec="png"), ValueError, "codec: the writer decides"),
+        (lambda: swm.policy.RandomPolicy(sed=3), TypeError, "unknown argument 'sed'; did you mean 'seed'"),
         (lambda: rooms().evaluate(policy=Zero(), protocol="loose"), ValueError, "compat"),
         (lambda: rooms().evaluate(policy=swm.policy.ExpertPolicy("weakk")), ValueError, "weak"),
         (lambda: rooms().evaluate(policy=Zero(), dataset="nothing"), FileNotFoundError, "nothing"),
+        (lambda: rooms().evaluate(policy=Zero(), dataset=swm.data.ReplayBuffer(9)), TypeError, "dataset: ReplayBuffer; exp"),
         (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1, seed=0), ValueError, "finite actions"),
         (lambda: rooms().evaluate(policy=Complex(), episodes=1, seed=0), ValueError, "real actions"),
     ],
@@ -646,6 +656,32 @@ def test_a_world_keeps_no_policy_that_nobody_else_keeps():
     del policy
     gc.collect()
     assert [one() is None for one in gone] == [True, True, True, False] and len(world._actors) == 1
+
+
+def test_a_changed_seed_reaches_every_world_of_a_policy():
+    worlds, policy = [rooms(num_envs=1, add_pixels=False) for _ in range(2)], swm.policy.RandomPolicy(seed=1)
+
+    def first_actions():
+        for world in worlds:
+            world.reset(seed=0)
+            world.step()
+        return [world.infos["action"].tolist() for world in worlds]
+
+    for world in worlds:
+        world.set_policy(policy)
+    before = first_actions()
+    policy.set_seed(5)
+    after = first_actions()
+    assert before[0] == before[1] != after[0] == after[1]
+
+
+def test_outputs_are_paths_of_any_kind(tmp_path):
+    class Located(os.PathLike):
+        def __fspath__(self):
+            return str(tmp_path / "a.h5")
+
+    rooms(max_episode_steps=3).collect(Located(), policy=swm.policy.RandomPolicy(), episodes=2, progress=False)
+    assert swm.data.load_dataset(Located()).num_episodes == 2
 
 
 def test_the_seed_of_a_policy_is_recorded_and_continued(tmp_path):

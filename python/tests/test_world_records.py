@@ -1,11 +1,14 @@
 """Tests of what the manifests of datasets and results record of policies and environments, and of what is therefore refused."""
 
+import copy
 import functools
 import io
 import json
 import os
+import pickle
 import random
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -223,23 +226,22 @@ def test_a_policy_that_cannot_be_recorded_is_evaluated(checkpoints, tmp_path, mo
         path = tmp_path / f"{type(policy).__name__}.h5"
         for episodes in (2, 4):
             assert collected(path, policy, episodes, mode="resume")["added"] == 2
-    # The checkpoint of a policy is removed while it acts, or a description fails.
+    # The weights are those that the engine loaded, whatever a description says.
     small = functools.partial(rooms, image_shape=(64, 64), max_episode_steps=5)
     model = swm.wm.load(checkpoints[0])
-    model.card["weights"] = None
-    assert evaluated(tmp_path, FeedForwardPolicy(model), small(), 2)["hashes"] == {}
+    weights, model.card["weights"] = model.card["weights"], None
 
     def fails(*_):
         raise OSError("removed")
 
     monkeypatch.setattr(swm.world.records, "_checkpoint_hash", fails)
-    for policy, kind in (
-        (FeedForwardPolicy(checkpoints[0]), "feed_forward"),
-        (swm.policy.MixturePolicy({"random": 1, checkpoints[0]: 1}), "mixture"),
-    ):
-        found = evaluated(tmp_path, policy, small(), 2)
-        acts = found["config"]["policies"][-1]["acts"]
-        assert kind in acts and "OSError: removed" in json.dumps(acts) and found["hashes"] == {}
+    for given in (model, checkpoints[0]):
+        assert list(evaluated(tmp_path, FeedForwardPolicy(given), small(), 2)["hashes"].values()) == [weights]
+    # A checkpoint of a policy is removed while it acts.
+    mixture = swm.policy.MixturePolicy({"random": 1, checkpoints[0]: 1})
+    found = evaluated(tmp_path, mixture, small(), 2)
+    acts = found["config"]["policies"][-1]["acts"]
+    assert "mixture" in acts and "OSError: removed" in json.dumps(acts) and found["hashes"] == {}
 
 
 def test_a_checkpoint_and_its_torch_module_do_not_continue_each_other(checkpoints, tmp_path):
@@ -720,3 +722,92 @@ def test_videos_are_named_relative_to_the_results(tmp_path, monkeypatch):
     with pytest.warns(UserWarning, match="episode-0.mp4, episode-1.mp4: these videos were replaced or moved since"):
         metrics.save("results/c.json")
     assert json.loads((tmp_path / "results/c.json").read_text())["runs"][-1]["videos"] == []
+
+
+@pytest.fixture
+def retrained(request, tmp_path):
+    """A function that puts one of two trained models in the place of a checkpoint, and returns its path."""
+    family, env = request.param
+    with swm.World(env, 2, image_shape=(64, 64), max_episode_steps=30) as world:
+        world.collect(tmp_path / "d.lance", policy=RandomPolicy(0), episodes=4, seed=0, progress=False)
+    short = {"data": str(tmp_path / "d.lance"), "preset": "tiny", "schedule__steps": 1, "data__batch_size": 4}
+    for seed in (0, 1):
+        out, settings = str(tmp_path / f"model-{seed}"), {**short, "seed": seed}
+        if family == "inverse":
+            # The network stays the same: what changes is the world model whose latents it gets.
+            swm.wm.train("lewm", out=f"{out}-encoder", **settings)
+            encoder = ["--encoder", f"{out}-encoder", "--output", out]
+            code, words = command(
+                "train", "inverse", "--data", tmp_path / "d.lance", *encoder, "schedule.steps=1", "batch_size=4"
+            )
+            assert code == 0, words
+        else:
+            swm.wm.train(family, out=out, **settings)
+
+    def put(seed):
+        shutil.rmtree(tmp_path / "model", ignore_errors=True)
+        shutil.copytree(tmp_path / f"model-{seed}", tmp_path / "model")
+        return str(tmp_path / "model")
+
+    put.env = env
+    return put
+
+
+@pytest.mark.parametrize(
+    ("retrained", "kind"),
+    [
+        (("tdmpc2", "swm/PendulumControl-v1"), "plans"),
+        (("tdmpc2", "swm/PendulumControl-v1"), "acts"),
+        (("inverse", "swm/TwoRoom-v1"), "acts"),
+    ],
+    indirect=["retrained"],
+)
+def test_the_weights_that_were_loaded_play_after_their_checkpoint_was_replaced(retrained, tmp_path, kind):
+    def policy(model):
+        if kind == "acts":
+            return FeedForwardPolicy(model)
+        solver = swm.planning.CEMSolver(model, num_samples=8, n_steps=1, topk=2)
+        return MPCPolicy(solver, swm.PlanConfig(horizon=2, receding_horizon=1))
+
+    def played(model):
+        settings = {"policy": policy(model), "episodes": 2, "seed": 0, "progress": False}
+        with swm.World(retrained.env, 2, image_shape=(64, 64), max_episode_steps=4) as world:
+            found = world.evaluate(**settings).results
+            world.collect(tmp_path / "e.lance", mode="overwrite", **settings)
+        dataset = swm.data.load_dataset(tmp_path / "e.lance", backend="numpy")
+        actions = np.nan_to_num(dataset.get_col_data("action")).tolist()
+        hashes = [list(found["manifest"]["hashes"].values()), list(dataset.manifest["hashes"].values())]
+        assert hashes == [[model.card["weights"]]] * 2
+        return found["runs"][0]["episodes"], actions
+
+    path = retrained(0)
+    model, first = swm.wm.load(path), played(swm.wm.load(path))
+    retrained(1)
+    assert played(model) == first != played(swm.wm.load(path))
+    shutil.rmtree(path)
+    assert played(model) == first
+    retrained(1)
+    for copied in (copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))):
+        with pytest.raises(ValueError, match="its weights were replaced since the model was loaded; load it again"):
+            copied(model)
+
+
+def test_evaluations_start_from_the_dataset_that_was_opened(tmp_path):
+    path, starts = tmp_path / "d.lance", {"goal_offset": 2, "eval_budget": 2, "progress": False}
+    collected(path, RandomPolicy(1))
+    opened = swm.data.load_dataset(path)
+
+    class Mirrored(type(opened)):
+        def load_episode(self, episode_idx):
+            return super().load_episode(episode_idx)
+
+    with rooms() as world:
+        with pytest.raises(TypeError, match="World.evaluate: .* would not call Mirrored.load_episode"):
+            world.evaluate(policy=RandomPolicy(), dataset=Mirrored(path), episodes=1, **starts)
+        world.evaluate(policy=RandomPolicy(), dataset=opened, episodes=1, **starts)
+        world.collect(path, policy=RandomPolicy(2), episodes=2, seed=9, mode="overwrite", progress=False)
+        with pytest.raises(RuntimeError, match="replaced since the dataset was opened"):
+            world.evaluate(policy=RandomPolicy(), dataset=opened, episodes=1, **starts)
+    with swm.World("swm/Piecewise-v0", 2, image_shape=(32, 32)) as other:
+        with pytest.warns(UserWarning, match="collected in swm/TwoRoom-v1, and its states are starts in swm/Piecewise-v0"):
+            other.evaluate(policy=RandomPolicy(), dataset=path, episodes=1, **starts)

@@ -124,8 +124,9 @@ impl Space {
         let integer = !matches!(self.dtype(), DType::Float32 | DType::Float64);
         let valid = value.len() == self.len()
             && value.iter().enumerate().all(|(i, &v)| {
-                let (low, high) = self.bounds(i);
-                v.is_finite() && v >= low && v <= high && (!integer || v.fract() == 0.0)
+                let ((low, high), rounded) = (self.bounds(i), self.round(v));
+                // A bound as it is written, such as 0.6, may lie beyond the bound in single precision.
+                v.is_finite() && rounded >= low && rounded <= high && (!integer || v.fract() == 0.0)
             });
         if valid {
             return Ok(());
@@ -194,5 +195,8 @@ mod tests {
             "agent.color = [0.0, 256.0, 3.0] is outside its space: expected a colour: 3 integers in 0 ..= 255"
         );
         assert!(spaces[2].check("door.number", &[1.5]).is_err());
+        let single = Space::uniform_box([1], DType::Float32, f64::from(0.6f32), f64::from(0.7f32));
+        assert!([0.6, 0.65, 0.7].iter().all(|&value| single.check("light", &[value]).is_ok()));
+        assert!([0.599, 0.701].iter().all(|&value| single.check("light", &[value]).is_err()));
     }
 }

@@ -17,6 +17,7 @@ A name that the engine reserves gets the prefix `obs_` or `info_`; entries that 
 """
 
 import ast
+import contextlib
 import difflib
 import functools
 import importlib.metadata
@@ -348,6 +349,15 @@ def flag(value, name):
     return bool(array.item())
 
 
+def number(reward):
+    """A reward as a float; some environments return an array of one element, or a tensor."""
+    array = np.asarray(reward.detach().cpu() if hasattr(reward, 'detach') else reward)
+    if array.dtype.kind in 'biufO' and array.size == 1:
+        with contextlib.suppress(TypeError, ValueError):
+            return float(array.item())
+    raise ValueError(f'the reward is {reward!r}: return a number')
+
+
 class Bridge:
     """One environment and the buffer it writes into."""
 
@@ -611,8 +621,8 @@ class Bridge:
         for view, value in self.held:
             view[...] = np.reshape(value, view.shape)
         terminated, truncated = flag(terminated, 'terminated'), flag(truncated, 'truncated')
-        if isinstance(reward, (str, bytes)):
-            raise ValueError(f'the reward is {reward!r}: return a number')
+        if not isinstance(reward, (float, int, np.floating)):
+            reward = number(reward)
         key = 'success' if 'success' in info else 'is_success'
         value = info.get(key)
         if value is None and key in info and self.states_success and (terminated or truncated):

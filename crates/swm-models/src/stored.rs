@@ -29,6 +29,8 @@ pub struct StoredCheckpoint {
     /// The hash of `config.json`; `None` for a capsule, which has a hash of its whole content.
     config_hash: Option<String>,
     weights: Weights,
+    /// The world model in the run folder, of a checkpoint in memory.
+    world_model: Option<Box<StoredCheckpoint>>,
 }
 
 /// The weights of a stored checkpoint.
@@ -56,7 +58,8 @@ impl StoredCheckpoint {
         let file = serde_json::from_slice(&text).map_err(|error| broken(&path, error.to_string()))?;
         let manifest = read_manifest(&folder)?;
         let weights = Weights::File(folder.join(WEIGHTS));
-        Ok(Self { run: run.to_owned(), path, file, manifest, config_hash: Some(manifest::hash(&text)), weights })
+        let config_hash = Some(manifest::hash(&text));
+        Ok(Self { run: run.to_owned(), path, file, manifest, config_hash, weights, world_model: None })
     }
 
     /// Returns the checkpoint in a capsule; `path` names the capsule in errors.
@@ -68,18 +71,42 @@ impl StoredCheckpoint {
             manifest: capsule.manifest.clone(),
             config_hash: None,
             weights: Weights::Loaded(capsule.weights.clone()),
+            world_model: None,
         }
     }
 
     /// Returns a checkpoint of these parts; `run` names it in errors. `file` is the content of `config.json`.
     pub(crate) fn of_parts(run: &Path, file: Value, manifest: Manifest, weights: Named<HostTensor>) -> Self {
         let weights = Weights::Loaded(weights);
-        Self { run: run.to_owned(), path: run.join(CONFIG), file, manifest, config_hash: None, weights }
+        let path = run.join(CONFIG);
+        Self { run: run.to_owned(), path, file, manifest, config_hash: None, weights, world_model: None }
     }
 
     /// Returns this checkpoint with another manifest and other weights.
     pub(crate) fn with(&self, manifest: Manifest, weights: Named<HostTensor>) -> Self {
         Self { manifest, weights: Weights::Loaded(weights), ..self.clone() }
+    }
+
+    /// Returns this checkpoint with its weights in memory: a training that replaces the files does not change it.
+    ///
+    /// # Errors
+    /// As [`StoredCheckpoint::weights`].
+    pub fn in_memory(self) -> Result<Self> {
+        let weights = Weights::Loaded(self.weights()?);
+        let has_world_model = self.world_model.is_none() && self.has_world_model();
+        let world_model = if has_world_model { Some(Box::new(self.world_model()?.in_memory()?)) } else { None };
+        Ok(Self { weights, world_model, ..self })
+    }
+
+    /// Returns the world model in the run folder.
+    ///
+    /// # Errors
+    /// As [`StoredCheckpoint::read`].
+    pub(crate) fn world_model(&self) -> Result<Self> {
+        match &self.world_model {
+            Some(stored) => Ok((**stored).clone()),
+            None => Self::read(&self.run.join(WORLD_MODEL)),
+        }
     }
 
     /// Returns the run folder, or the path of the capsule.

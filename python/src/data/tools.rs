@@ -170,10 +170,22 @@ pub fn check_replacement(path: &str) -> PyResult<()> {
     formats::interrupted(&location).map_or(Ok(()), |error| Err(to_py_err(error)))
 }
 
-/// The location of an existing dataset, given by path, URI or name.
+/// The location of an existing dataset, given by path, URI or name. A dataset of a hub is downloaded.
 #[pyfunction]
-pub fn find_dataset(path: &str) -> PyResult<String> {
-    home::find_dataset(path).map(|location| location.to_string()).map_err(to_py_err)
+pub fn find_dataset(py: Python<'_>, path: &str) -> PyResult<String> {
+    exit::detached(py, || home::find_dataset(path).map(|location| location.to_string())).map_err(to_py_err)
+}
+
+/// A warning if a dataset was recorded in another environment than the one that starts from its rows.
+#[pyfunction]
+pub fn warning_of_starts(py: Python<'_>, dataset: &str, env: &str) -> PyResult<Option<String>> {
+    exit::detached(py, || Ok(swm::resolver::warning_of_starts(dataset, env))).map_err(to_py_err)
+}
+
+/// The URI of a dataset of a hub with the commit that it has now; another URI, path or name unchanged.
+#[pyfunction]
+pub fn pinned_dataset(py: Python<'_>, path: &str) -> PyResult<String> {
+    exit::detached(py, || home::pinned_dataset(path)).map_err(to_py_err)
 }
 
 /// Completes or undoes an interrupted replacement of the dataset at a path or URI.

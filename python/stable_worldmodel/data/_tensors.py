@@ -89,7 +89,7 @@ def _check_numbering(name: str, value: Any) -> None:
     """Refuses a column that has a name of `NUMBERING` and holds something else."""
     try:
         numbers = np.asarray(to_numpy(value), dtype=np.float64).reshape(-1)
-        fits = bool(np.all(np.diff(numbers) == (1 if name == "step_idx" else 0)))
+        fits = bool(np.all(numbers == np.round(numbers)) and np.all(np.diff(numbers) == (1 if name == "step_idx" else 0)))
     except (TypeError, ValueError):
         fits = False
     if not fits:
@@ -103,8 +103,10 @@ def _check_numbering(name: str, value: Any) -> None:
 def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | bytes]]:
     """Splits an episode into arrays `(T, ...)` of types that can be stored, and text constants.
 
-    `episode_idx` and `step_idx` are left out, because datasets number episodes and steps; other values of these names are
-    errors. Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row fewer than
+    `episode_idx` and `step_idx` are left out, because datasets number episodes and steps from 0; other values of these names
+    than one number, and those of consecutive steps, are errors.
+
+    Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row fewer than
     the other columns, because no action follows the final observation.
     """
     arrays: dict[str, Array] = {}

@@ -147,7 +147,7 @@ class ReplayBuffer(Dataset):
         self.history_len = int(history_len)
         self.sampler = sampler
         self.key_filter = key_filter
-        self.seed = _options.whole("seed", seed)
+        self.seed = _options.count("seed", seed, 0)
         self._buffer: Any = None
         self._columns: list[tuple[str, str, list[int]]] = []
         #: Held while the content changes, and while a sampler of the user, which may call the buffer, chooses from it.

@@ -6,12 +6,13 @@ import copy
 import json
 import os
 import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stable_worldmodel import _engine
+from stable_worldmodel import _engine, _options
 
 from . import _collate, _tensors
 from ._tensors import NUMBERING, Array
@@ -53,12 +54,9 @@ class Dataset:
         num_steps: int = 1,
         transform: Transform | None = None,
     ) -> None:
-        if frameskip < 1 or num_steps < 1:
-            raise ValueError(f"expected a frameskip and num_steps of at least 1, got {frameskip} and {num_steps}")
-        self.lengths = np.asarray(lengths, dtype=np.int64)
-        self.offsets = np.asarray(offsets, dtype=np.int64)
-        self.frameskip = int(frameskip)
-        self.num_steps = int(num_steps)
+        self.frameskip = _options.count("frameskip", frameskip)
+        self.num_steps = _options.count("num_steps", num_steps)
+        self.lengths, self.offsets = (np.array(rows, dtype=np.int64) for rows in (lengths, offsets))
         self.span = self.num_steps * self.frameskip
         self.transform = transform
         clips = np.maximum(self.lengths - self.span + 1, 0)
@@ -106,11 +104,12 @@ class Dataset:
         start = int(starts[0])
         return self._grouped(self._load_slice(int(episodes[0]), start, start + self.span), self.num_steps)
 
-    @staticmethod
-    def _grouped(sample: dict[str, Any], steps: int) -> dict[str, Any]:
+    def _grouped(self, sample: dict[str, Any], steps: int) -> dict[str, Any]:
         """The sample, with the actions of each step joined into one row of `action`."""
         if "action" in sample:
-            sample["action"] = sample["action"].reshape(steps, -1)
+            action = sample["action"]
+            # The width is stated, because there may be no steps.
+            sample["action"] = action.reshape(steps, self.frameskip * int(np.prod(action.shape[1:])))
         return sample
 
     def load_chunk(
@@ -258,6 +257,9 @@ class StoredDataset(Dataset):
         self._merged: dict[str, Array] = {}
         #: The dataset with the columns that `merge_col` added, as an object of the engine.
         self._view: Any = None
+        for given, names in (("keys_to_load", keys_to_load), ("keys_to_cache", keys_to_cache)):
+            if isinstance(names, str):
+                raise TypeError(f"{given}: {names!r}; expected a list of columns, such as [{names!r}]")
         self._keys = [name for name in self.schema if name not in NUMBERING] if keys_to_load is None else [*keys_to_load]
         self._cached = [*(keys_to_cache or [])]
         for target, source in (keys_to_merge or {}).items():
@@ -270,6 +272,14 @@ class StoredDataset(Dataset):
     def _open(self) -> Any:
         handle = _engine.Dataset(self.path, self.format, self._mark)
         return handle.cached(self._cached, 1 << 62) if self._cached else handle
+
+    def check_unchanged(self) -> None:
+        """Checks that the path still has this dataset.
+
+        Raises:
+            RuntimeError: If it was replaced.
+        """
+        _engine.Dataset(self.path, self.format, self._mark)
 
     @property
     def _stored(self) -> Any:
@@ -711,6 +721,11 @@ class ConcatDataset:
         having = [dataset for dataset in self.datasets if col in dataset.column_names]
         if not having:
             raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
+        if len(having) < len(self.datasets):
+            problem = (
+                f"{len(having)} of {len(self.datasets)} datasets have column {col!r}: rows are those of their episodes only"
+            )
+            warnings.warn(f"get_col_data: {problem}, which `offsets` does not count", stacklevel=2)
         return np.concatenate([np.asarray(dataset.get_col_data(col)) for dataset in having])
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Any]:
@@ -719,6 +734,10 @@ class ConcatDataset:
         found = [self.datasets[part].get_row_data(row) for part, row in zip(parts.tolist(), rows.tolist(), strict=True)]
         if np.ndim(row_idx) == 0:
             return dict(found[0])
+        if any(row.keys() != found[0].keys() for row in found):
+            names = [sorted(row) for row in found]
+            problem = f"some rows have other columns: {next(other for other in names if other != names[0])} and {names[0]}"
+            raise KeyError(f"get_row_data: {problem}; get them one by one, or join datasets with equal columns")
         return {name: np.stack([row[name] for row in found]) for name in found[0]}
 
 
@@ -794,8 +813,8 @@ class GoalDataset:
     """A dataset whose samples have a goal: a row of the dataset, `(1, ...)`.
 
     The goal is a random row of the dataset, a later step of the episode (nearer steps more likely, or all steps equally
-    likely), or the current step. Clips without a later step are left out if the goal can be a later step. The clips of a
-    :class:`ReplayBuffer` are those of its content at each call.
+    likely), or the current step. Clips without a later step are left out if the goal can be a later step, and clips whose
+    current step is beyond the episode. The clips of a :class:`ReplayBuffer` are those of its content at each call.
 
     Args:
         dataset: The dataset.
@@ -803,8 +822,9 @@ class GoalDataset:
             uniformly distributed later step, and the current step.
         gamma: The discount of the geometric distribution: the goal is `k` steps ahead with probability
             `(1 - gamma) * gamma**(k - 1)`. A distance beyond the episode selects the last step.
-        current_goal_offset: The current step of the clip, counted from 1; the last step for `None`.
+        current_goal_offset: The current step, counted from 1 at the clip's first one; the clip's last step for `None`.
         goal_keys: The columns to load from the goal row, and their names in the sample; `pixels` and `proprio` for `None`.
+            Columns that samples do not have are left out, with a warning.
         seed: The seed of goals, combined with the epoch and the sample's index. Goals are random for `None`.
     """
 
@@ -833,9 +853,16 @@ class GoalDataset:
         self.current_goal_offset = int(_tensors.whole("current_goal_offset", offset))
         if self.current_goal_offset < 1:
             raise ValueError(f"current_goal_offset: expected a step of the clip, counted from 1, got {current_goal_offset}")
-        if goal_keys is None:
-            goal_keys = {name: f"goal_{name}" for name in ("pixels", "proprio") if name in dataset.column_names}
-        self.goal_keys = dict(goal_keys)
+        by_default = {name: f"goal_{name}" for name in ("pixels", "proprio") if name in dataset.column_names}
+        self.goal_keys = dict(by_default if goal_keys is None else goal_keys)
+        names, given = dataset.column_names, {} if goal_keys is None else self.goal_keys
+        # Environments have columns such as `goal_state`, in whose place goals of that name are meant.
+        if replaced := [goal for name, goal in given.items() if goal in names and goal != f"goal_{name}"]:
+            warnings.warn(f"goal_keys: the drawn goals replace the dataset's columns {replaced} in samples", stacklevel=2)
+        # The columns of an empty buffer, and those that a transform makes, are not known yet.
+        known = names and not transforms_of(dataset)
+        if known and (unknown := [name for name in given if name not in names]):
+            warnings.warn(f"goal_keys: the dataset has no {unknown}, so samples have no such goals", stacklevel=2)
         self.seed = seed
         self.epoch = 0
         self._fresh: tuple[int, np.random.Generator] | None = None
@@ -856,12 +883,11 @@ class GoalDataset:
             lengths = np.asarray(content.lengths)
             clips = np.asarray(content.clip_indices, dtype=np.int64).reshape(-1, 2)
             _, geometric, uniform, _ = self.goal_probabilities
-            if geometric > 0 or uniform > 0:
-                later = clips[:, 1] + self._ahead + self.dataset.frameskip < lengths[clips[:, 0]]
-            else:
-                later = np.ones(len(clips), dtype=bool)
+            ahead = self._ahead + (self.dataset.frameskip if geometric > 0 or uniform > 0 else 0)
+            # The current step can lie beyond the clip, but not beyond the episode.
+            fits = clips[:, 1] + ahead < lengths[clips[:, 0]]
             rows_before = np.cumsum([0, *lengths.tolist()])
-            self._found = found = _GoalClips(content, np.flatnonzero(later), clips[later], lengths, rows_before)
+            self._found = found = _GoalClips(content, np.flatnonzero(fits), clips[fits], lengths, rows_before)
         return found
 
     def set_epoch(self, epoch: int) -> None:

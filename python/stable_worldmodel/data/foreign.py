@@ -6,7 +6,7 @@ import contextlib
 import copy
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any
 
@@ -102,23 +102,30 @@ def engine_of(dataset: Any) -> Any:
     return _engine.Dataset.foreign(_Rows(dataset))
 
 
-def check_overrides(caller: str, dataset: Any, instead: str) -> None:
+#: The methods that return samples.
+_SAMPLES = ("__getitem__", "__getitems__")
+#: The methods that read rows.
+ROWS = ("load_chunk", "load_episode", "_load_slice")
+
+
+def check_overrides(caller: str, dataset: Any, instead: str, methods: Sequence[str] = (*_SAMPLES, *ROWS)) -> None:
     """Checks that the engine reads what a dataset's class returns.
 
     Args:
         caller: The function or class that reads the dataset in the engine.
         dataset: The dataset; datasets that it joins are checked, too.
         instead: What the user can do instead.
+        methods: The methods that decide what is read.
 
     Raises:
         TypeError: If a user's subclass of a dataset that the engine reads overrides how it is read.
     """
     if isinstance(dataset, (StoredDataset, ReplayBuffer, ConcatDataset, MergeDataset)):
-        for method in ("__getitem__", "__getitems__", "load_chunk", "load_episode", "_load_slice"):
+        for method in methods:
             if hasattr(dataset, method) and is_overridden(dataset, method):
                 raise TypeError(
                     f"{caller}: the engine reads stored rows and would not call {type(dataset).__name__}.{method}; {instead}"
                 )
     if isinstance(dataset, (ConcatDataset, MergeDataset)):
         for part in dataset.datasets:
-            check_overrides(caller, part, instead)
+            check_overrides(caller, part, instead, methods)

@@ -164,8 +164,19 @@ def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode
 
 
 def foreign_writer(path: str | os.PathLike[str], format: str | None, mode: str) -> Any | None:
-    """A writer of a user-defined format; `None` for formats of the engine. The mode `"resume"` appends."""
+    """A writer of a user-defined format; `None` for formats of the engine. The mode `"resume"` appends.
+
+    Raises:
+        FileExistsError: If the mode is `"error"`, and there is a file, or a folder that is not empty.
+    """
     kind = _foreign(path, format)
+    text = os.fspath(path)
+    if kind is not None and mode == "error" and "://" not in text and os.path.lexists(text):
+        # Not left to the user's writer, because the default must not replace anything.
+        if not os.path.isdir(text) or os.listdir(text):
+            raise FileExistsError(
+                f"{text}: there is a dataset already; continue it (mode='append' or 'resume') or replace it (mode='overwrite')"
+            )
     mode = "append" if mode == "resume" else mode
     return None if kind is None else kind.open_writer(path, mode=validate_write_mode(mode))
 

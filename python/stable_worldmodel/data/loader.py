@@ -44,7 +44,7 @@ class Goals:
     """The distribution of a goal row for every clip.
 
     A batch has the goal's columns as `NAME_COLUMN` `(B, 1, ...)`. `NAME_offset` `(B,)` is the number of rows from the anchor
-    (a step of the clip) to the goal, or -1 if the goal is not a later row of the same episode.
+    (a step of the clip) to the goal: 0 for the anchor itself, and -1 for an earlier row or one of another episode.
 
     Attributes:
         columns: The columns to load from the goal row.
@@ -72,7 +72,8 @@ class Goals:
         """The goal specification for the engine."""
         chances = ("random", "geometric", "future", "last", "current", "discount")
         mixture = {chance: float(getattr(self, chance)) for chance in chances}
-        return {"name": self.name, "columns": [*self.columns], "anchor": self.anchor, "mixture": mixture}
+        anchor = None if self.anchor is None else _options.count("Goals.anchor", self.anchor, 0)
+        return {"name": self.name, "columns": [*self.columns], "anchor": anchor, "mixture": mixture}
 
 
 def bytes_of(given: int | str) -> int:
@@ -269,15 +270,22 @@ class Loader:
     def state_dict(self) -> dict[str, int]:
         """The position of the iteration, for :meth:`load_state_dict`."""
         epoch, batch = self._at
-        clips = self.num_clips
-        return {"epoch": epoch, "batch": batch, "seed": self.seed, "batch_size": self.batch_size, "clips": clips}
+        settings = {name: int(json.loads(self._settings)[name]) for name in ("num_steps", "frameskip", "shuffle")}
+        position = {"epoch": epoch, "batch": batch}
+        return {**position, "seed": self.seed, "batch_size": self.batch_size, "clips": self.num_clips, **settings}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continues at a saved position: the next batches equal the batches that followed the position."""
+        """Continues at a saved position: the next batches equal the batches that followed the position.
+
+        The rank and the number of processes may be others, which divide each batch otherwise.
+        """
         own = self.state_dict()
-        if not isinstance(state, Mapping) or any(name not in state for name in own):
+        needed = ("epoch", "batch", "seed", "batch_size", "clips")
+        if not isinstance(state, Mapping) or any(name not in state for name in needed):
             raise ValueError(f"state: expected what state_dict returned, with the keys {', '.join(own)}, got {state!r}")
-        changed = {name: (state[name], own[name]) for name in ("seed", "batch_size", "clips") if state[name] != own[name]}
+        # States of earlier versions have fewer settings.
+        settings = [name for name in own if name not in ("epoch", "batch") and name in state]
+        changed = {name: (state[name], own[name]) for name in settings if state[name] != own[name]}
         if changed:
             changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in changed.items())
             raise ValueError(

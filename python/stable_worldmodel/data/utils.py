@@ -48,8 +48,14 @@ def ensure_dir_exists(path: str | Path) -> None:
 
 
 def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None = None) -> str:
-    """The location of an existing dataset, given by path, URI, or name under `datasets` of the home folder or `cache_dir`."""
+    """The location of an existing dataset, given by path, URI, or name under `datasets` of the home folder or `cache_dir`.
+
+    Datasets of a hub (`hf://`, `lerobot://`) are downloaded.
+    """
     text = os.fspath(given)
+    if text.startswith("hf://"):
+        return _engine.find_dataset(text)
+    uri, text = text, text.removeprefix("lerobot://")
     if "://" in text:
         return text
     datasets = Path(_engine.home() if cache_dir is None else cache_dir).expanduser() / "datasets"
@@ -60,7 +66,8 @@ def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | N
     for candidate in candidates:
         if candidate.exists():
             return os.path.abspath(candidate)
-    return os.path.abspath(_engine.find_dataset(text))
+    # Of `lerobot://`, what is not on this machine is on the hub.
+    return os.path.abspath(_engine.find_dataset(uri))
 
 
 def load_dataset(
@@ -82,7 +89,7 @@ def load_dataset(
         dataset[0]["action"].shape  # (4, 10): the five actions of every step
 
     Args:
-        name: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`), or a name under `$STABLEWM_HOME/datasets`.
+        name: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`, `hf://`), or a name under `$STABLEWM_HOME/datasets`.
         cache_dir: A folder in place of `$STABLEWM_HOME`.
         format: The format's name; `None` detects it from the path.
         num_steps: The number of steps of a clip.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import _engine, _files
+from .. import _engine, _files, _options
 
 __all__ = ["save_panel_videos", "save_video"]
 
@@ -22,16 +22,20 @@ def save_video(path: str | os.PathLike[str], frames: Sequence[Any] | np.ndarray,
         fps: Frames per second.
 
     Raises:
-        ValueError: If the path is a URI, or the frames have another type or shape.
+        ValueError: If the path is a URI or has another suffix than `.mp4`, or the frames have another type or shape.
     """
     if len(frames) == 0:
         return
-    path = _files.local("path", path)
+    path, fps = _files.local("path", path), int(_options.finite("fps", fps))
+    if fps < 1:
+        raise ValueError(f"fps: {fps}; expected at least 1 frame per second")
+    if path.suffix.lower() != ".mp4":
+        raise ValueError(f"path: {path}; videos are MP4 files: use a name that ends in .mp4")
     path.parent.mkdir(parents=True, exist_ok=True)
     stacked = np.stack([np.asarray(frame) for frame in frames])
     if stacked.dtype != np.uint8 or stacked.ndim != 4:
         raise ValueError(f"save_video: expected frames (height, width, 3) of uint8, got {stacked.dtype} {stacked.shape[1:]}")
-    _engine.write_video(str(path), np.ascontiguousarray(stacked), int(fps))
+    _engine.write_video(str(path), np.ascontiguousarray(stacked), fps)
 
 
 def save_panel_videos(
@@ -47,9 +51,12 @@ def save_panel_videos(
         fps: Frames per second.
 
     Raises:
-        ValueError: If the folder is a URI.
+        ValueError: If the folder is a URI, or there are no panels, or panels of other numbers of environments.
     """
     folder, labels = _files.local("video_dir", video_dir), list(panels)
+    counts = {label: len(panels[label]) for label in labels}
+    if len(set(counts.values())) != 1:
+        raise ValueError(f"panels: they have the environments {counts}; give at least one panel, each with the same number")
     for env in range(len(panels[labels[0]])):
         videos = [np.asarray(panels[label][env]) for label in labels]
         videos = [video if video.ndim == 4 else video[None] for video in videos]

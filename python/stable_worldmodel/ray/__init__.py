@@ -98,7 +98,7 @@ def train(
 
     Each run is a folder of the output, such as `seed=0,optim.lr=0.001`.
     """
-    swept = [f"{key}={','.join(str(value) for value in values)}" for key, values in (sweep or {}).items()]
+    swept = [f"{key}={','.join(_options.setting(value, key) for value in values)}" for key, values in (sweep or {}).items()]
     return submit(["train", model, *settings, "--output", os.fspath(output)], options | {"sweep": swept})
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -15,6 +16,10 @@ __all__ = ["run"]
 
 #: The dataset has another name in Hydra's configuration, whose `data` is a table of settings.
 _DATASET = "dataset"
+#: The options that are names or paths.
+_NAMES = (_DATASET, "out", "preset", "device")
+#: What Hydra reads as a number.
+_NUMBER = re.compile(r"[+-]?(\d[\d_]*(\.[\d_]*)?|\.\d[\d_]*)(e[+-]?[\d_]+)?", re.IGNORECASE)
 
 
 def run(family: str, arguments: Sequence[str], train: Callable[[Options], object]) -> None:
@@ -43,9 +48,10 @@ def run(family: str, arguments: Sequence[str], train: Callable[[Options], object
         # Hydra would take the last value.
         if given_keys.count(key) > 1:
             raise ValueError(f"{key}: given twice; give it once, for a sweep with several values: {key}=A,B")
+    named = [_quoted(argument) for argument in named]
     # Hydra takes flags before overrides only.
     named.sort(key=lambda argument: "=" in argument and not argument.startswith("-"))
-    preset = next((argument.partition("=")[2] for argument in named if argument.startswith("preset=")), None)
+    preset = next((argument.partition("=")[2] for argument in arguments if argument.startswith("preset=")), None)
     own = {item.name: item.default for item in fields(Options) if item.name not in ("family", "data", "settings")}
     config = {_DATASET: "???", **own, **json.loads(_engine.training_config(family, preset, []))}
     ConfigStore.instance().store(name="train", node=OmegaConf.create(config))
@@ -64,6 +70,15 @@ def run(family: str, arguments: Sequence[str], train: Callable[[Options], object
 
     sys.argv = [sys.argv[0], *named]
     hydra.main(version_base="1.3", config_path=None, config_name="train")(job)()
+
+
+def _quoted(argument: str) -> str:
+    """An argument of the command line, with quotes around names that Hydra would read as numbers, such as `2026_11_29`."""
+    key, separator, value = argument.partition("=")
+    if key.lstrip("+") not in _NAMES or any(sign in value for sign in "'\"([{"):
+        return argument
+    names = [f"'{name}'" if _NUMBER.fullmatch(name) else name for name in value.split(",")]
+    return f"{key}{separator}{','.join(names)}"
 
 
 def _toml(value: Any) -> str:

@@ -29,6 +29,9 @@ __all__ = ["Model", "load", "train"]
 class Model:
     """A checkpoint, for planning (`get_cost`) or for acting (`swm.policy.FeedForwardPolicy`).
 
+    The weights stay in memory: a training that replaces them does not change the model. Copies and other processes load the
+    checkpoint again, and refuse other weights.
+
     Args:
         name: The path of a checkpoint or a capsule, a name under `$STABLEWM_HOME/checkpoints`, or `zoo:` and the name of a
             capsule (`swm zoo` lists them). An existing path counts before a name.
@@ -38,16 +41,19 @@ class Model:
         trust: Whether the checkpoint may choose an environment that imports a Python module, which `get_action` makes.
     """
 
-    def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None, *, trust: bool = False) -> None:
-        self._engine_model = _engine.Model(str(name), device, json.dumps(objective), bool(trust))
-        self._arguments = (str(name), device, objective, bool(trust))
+    def __init__(
+        self, name: str | os.PathLike[str], device: str = "cpu", objective: dict[str, Any] | None = None, *, trust: bool = False
+    ) -> None:
+        name = os.fspath(name)
+        self._engine_model = _engine.Model(name, device, json.dumps(objective), bool(trust))
+        self._arguments = (name, device, objective, bool(trust))
         #: The checkpoint info: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights`, `action_mean` and
         #: `action_std`.
         self.card: dict[str, Any] = json.loads(self._engine_model.info)
 
     def __reduce__(self) -> Any:
-        """The arguments: a copy loads the checkpoint again."""
-        return _opened, self._arguments
+        """The arguments: a copy loads the checkpoint again, which must have the same weights."""
+        return _opened, (*self._arguments, self.card["weights"])
 
     @property
     def path(self) -> str:
@@ -60,8 +66,8 @@ class Model:
         return int(self.card["action_block"])
 
     @property
-    def _engine_policy(self) -> str:
-        return self.path
+    def _engine_policy(self) -> Any:
+        return self._engine_model
 
     def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
         """The costs of candidate action sequences.
@@ -120,11 +126,16 @@ class Model:
         return f"Model({self.card['family']}, {self.path!r})"
 
 
-def _opened(name: str, device: str, objective: dict[str, Any] | None, trust: bool) -> Model:
-    return Model(name, device, objective, trust=trust)
+def _opened(name: str, device: str, objective: dict[str, Any] | None, trust: bool, weights: str | None = None) -> Model:
+    model = Model(name, device, objective, trust=trust)
+    if weights not in (None, model.card["weights"]):
+        raise ValueError(
+            f"checkpoint {name}: its weights were replaced since the model was loaded; load it again (swm.wm.load)"
+        )
+    return model
 
 
-def load(name: str, device: str = "cpu", **kwargs: Any) -> Model:
+def load(name: str | os.PathLike[str], device: str = "cpu", **kwargs: Any) -> Model:
     """Loads a checkpoint or a capsule by name or path, as `Model`."""
     return Model(name, device, **kwargs)
 

@@ -64,7 +64,7 @@ class VCReg(nn.Module):
     def forward(self, z: Tensor) -> dict[str, Tensor]:
         """The terms `std_loss`, `cov_loss` (over B) and `std_t_loss`, `cov_t_loss` (over T) of latents `(B, T, D)`.
 
-        Latents `(B, D)` are those of one step.
+        Latents `(B, D)` are those of one step. The terms over T are NaN for one step, and those over B for one clip.
         """
         if z.ndim == 2:
             z = z.unsqueeze(1)

@@ -11,7 +11,8 @@ import json
 import os
 import sys
 import types
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -119,7 +120,7 @@ def stored_policy(path: str, format: str | None) -> str:
 
 
 def evaluation_manifest(
-    world: World, policy: Any, config: Mapping[str, Any], names: list[str], dataset: str | None
+    world: World, policy: Any, config: Mapping[str, Any], acting: Sequence[tuple[str, Any]], dataset: str | None
 ) -> dict[str, Any]:
     """The manifest of the results of an evaluation.
 
@@ -130,15 +131,18 @@ def evaluation_manifest(
         world: The world.
         policy: The policy.
         config: The settings of the evaluation, as the engine gets them.
-        names: The names of the runs: that of the policy, and `random` if the random-policy floor was played.
+        acting: The names of the runs with the engine's actors: the policy, and `random` if the random-policy floor is played.
         dataset: The dataset of the starts.
     """
-    entry, weights = _evaluated_policy(policy, world, names[0])
+    (name, actor), *others = acting
+    entry, weights = _evaluated_policy(policy, world, name, actor.weights)
     wrappers, _ = wrapper_records(world, policy)
-    entries = [{"name": name, "acts": "random"} for name in names[1:]]
-    hashes = {} if weights is None else {f"weights of {names[0]}": weights}
+    entries = [{"name": name, "acts": "random"} for name, _ in others]
+    hashes = {} if weights is None else {f"weights of {name}": weights}
     starts: Any = "episodic"
     if dataset is not None:
+        if warning := _engine.warning_of_starts(dataset, world.env_name):
+            warnings.warn(warning, stacklevel=3)
         # The engine says what is wrong with a dataset that cannot be read.
         with contextlib.suppress(Exception):
             hashes["dataset"] = _content_hash(dataset)
@@ -189,8 +193,8 @@ def _content_hash(name: str) -> str:
     return known[1]
 
 
-def _evaluated_policy(policy: Any, world: World, name: str) -> tuple[dict[str, Any], str | None]:
-    """The entry of a policy in the manifest of results, and the hash of its weights.
+def _evaluated_policy(policy: Any, world: World, name: str, loaded: str | None) -> tuple[dict[str, Any], str | None]:
+    """The entry of a policy in the manifest of results, and the hash of its weights; `loaded` is that of the engine's actor.
 
     Settings that cannot be recorded are named. Results are compared nevertheless, because one policy is usually evaluated
     several times.
@@ -200,7 +204,8 @@ def _evaluated_policy(policy: Any, world: World, name: str) -> tuple[dict[str, A
     weights, choice = None, None if is_own else getattr(policy, "_choice", None)
     try:
         settings = policy_settings(policy, world)
-        weights = weights_hash(policy)
+        # The files of a checkpoint may have been replaced since the engine loaded it.
+        weights = loaded if loaded is not None and _plays_checkpoint(policy) else weights_hash(policy)
         models = {one["name"] for one in choice or ()} - _RESERVED - (_experts(world.env_name) if choice else set())
         choice = [{**one, "weights": _checkpoint_hash(one["name"])} if one["name"] in models else one for one in choice or ()]
     except Exception as error:

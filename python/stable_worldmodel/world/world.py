@@ -170,8 +170,9 @@ class World:
         self._steps_in_engine = True
         #: The seed of the episodes that `step` plays.
         self.seed: int | None = None
-        #: References to policies, and their actors, by the id of the policy. An actor ends with its policy.
-        self._actors: dict[int, tuple[Callable[[], Any], Any]] = {}
+        #: References to policies, their actors, and how often the policy had changed, by the id of the policy. An actor ends
+        #: with its policy.
+        self._actors: dict[int, tuple[Callable[[], Any], Any, int]] = {}
         self._episodes = [0] * self.num_envs
         #: The engine's keys of these episodes.
         self._episode_keys = np.zeros(self.num_envs, np.uint64)
@@ -380,7 +381,8 @@ class World:
         actor = None
         if self._steps_in_engine:
             known = self._actors.get(id(policy))
-            actor = known[1] if known is not None and known[0]() is policy else self._actor(policy)
+            is_known = known is not None and known[0]() is policy and known[2] == getattr(policy, "_changes", 0)
+            actor = known[1] if known is not None and is_known else self._actor(policy)
         if actor is not None and isinstance(self._reset_text, str):
             begun, self._next_episode = self._world.play(actor, steps, self.seed or 0, self._next_episode, self._reset_text)
             for slot, episode in begun:
@@ -464,7 +466,7 @@ class World:
         self._fresh[list(slots)] = True
         self._any_fresh = True
         # Those that act within a policy implemented in Python as well.
-        for _, actor in list(self._actors.values()):
+        for _, actor, _ in list(self._actors.values()):
             for slot in slots:
                 self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
 
@@ -520,8 +522,8 @@ class World:
 
     def _actor(self, policy: Any) -> Any:
         """The engine's actor of a policy; `None` for a policy implemented in Python."""
-        known = self._actors.get(id(policy))
-        if known is not None and known[0]() is policy:
+        known, changes = self._actors.get(id(policy)), getattr(policy, "_changes", 0)
+        if known is not None and known[0]() is policy and known[2] == changes:
             return known[1]
         make = getattr(policy, "_actor", None)
         if make is not None and self._wrapped_in_python:
@@ -529,7 +531,7 @@ class World:
             check_experts(self, policy, is_asked=is_overridden(policy, "get_action") or policy is not self.policy)
         actor = make(self) if make is not None else None
         if actor is not None:
-            self._actors[id(policy)] = (_reference(policy, self._actors), actor)
+            self._actors[id(policy)] = (_reference(policy, self._actors), actor, changes)
             for slot in range(self.num_envs):
                 self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
         return actor
@@ -562,7 +564,7 @@ class World:
 
     def collect(
         self,
-        path: str | Path | None = None,
+        path: str | os.PathLike[str] | None = None,
         episodes: int = 0,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
@@ -570,7 +572,7 @@ class World:
         writer: Any = None,
         progress: bool = True,
         *,
-        dataset_path: str | Path | None = None,
+        dataset_path: str | os.PathLike[str] | None = None,
         policy: Any = None,
         mode: str = "error",
         codec: str | None = None,
@@ -611,10 +613,13 @@ class World:
             the finished episodes remain stored.
         """
         path = dataset_path if path is None else path
+        path = None if path is None else os.fspath(path)
         if (path is None) == (writer is None):
             raise ValueError("World.collect: expected either a path or a writer")
         if mode not in ("error", "overwrite", "append", "resume"):
             raise ValueError(f"mode: {mode!r}; expected 'error', 'overwrite', 'append' or 'resume'")
+        if goal and self._image is None:
+            raise ValueError("goal: the world has no frames (add_pixels=False), so it has none of the goal; leave goal out")
         episodes = _options.count("episodes", episodes)
         action_noise = _options.finite("action_noise", action_noise)
         if isinstance(policy, Mapping):
@@ -624,15 +629,19 @@ class World:
         _check_storable(self.single_action_space)
         policy = self._chosen(policy)
         if writer is None and format is None:
-            format = _FORMAT_OF_SUFFIX.get(Path(str(path)).suffix)
+            format = _FORMAT_OF_SUFFIX.get(Path(path or "").suffix)
         first = 0
         if path is not None and writer is None and format not in _engine.formats():
             from ..data.format import foreign_episodes, foreign_writer
 
             first = foreign_episodes(path, format, mode)
             writer = foreign_writer(path, format, mode)
+        if codec is not None and writer is not None:
+            raise ValueError(
+                "codec: the writer decides how frames are stored; leave codec out, or pass a path of another format"
+            )
         is_stored = writer is None
-        begun = stored_policy(str(path), format) if is_stored and mode in ("append", "resume") else ""
+        begun = stored_policy(path, format) if is_stored and path is not None and mode in ("append", "resume") else ""
         # A policy of the user may learn between collections: its weights are compared if the dataset was begun with them.
         learns = (mode == "append" or bool(begun)) and is_overridden(policy, "get_action") and ",weights=" not in begun
         recorded, problem = collected_policy(policy, self, is_stored=is_stored, with_weights=not learns)
@@ -668,8 +677,9 @@ class World:
             # The writer suppressed the error, but there is no collection to report.
             assert failed is not None
             raise failed
+        assert path is not None
         if mode == "append" or (mode == "resume" and problem):
-            stored = _engine.World.stored(str(path), format) or 0
+            stored = _engine.World.stored(path, format) or 0
             if stored and problem:
                 raise ValueError(
                     f"World.collect: mode={mode!r} continues a dataset with the policy and the wrappers that it records, and "
@@ -678,7 +688,7 @@ class World:
                 )
             config["episodes"] += stored if mode == "append" else 0
         engine_mode = {"error": "create", "resume": "append"}.get(mode, mode)
-        return self._collect(policy, str(path), None, format, engine_mode, codec, config, progress)
+        return self._collect(policy, path, None, format, engine_mode, codec, config, progress)
 
     def _collect(
         self,
@@ -710,7 +720,7 @@ class World:
         episodes: int | None = None,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
-        video: str | Path | None = None,
+        video: str | os.PathLike[str] | None = None,
         reset_mode: str | None = None,
         dataset: Any = None,
         episodes_idx: Sequence[int] | None = None,
@@ -734,8 +744,9 @@ class World:
             seed: The seed of starts, goals, factors and plans; random for `None`.
             options: Factors to sample (`variation`) and to pin (`variation_values`). `variation` replaces the factors that a
                 reset samples by itself, such as the start: name these as well, or all episodes start alike.
-            video: A folder for videos of the first episodes, with their first frames as PNG files beside them. Those of an
-                earlier evaluation are replaced. `swm report` shows videos in the folder of the saved results, or below.
+            video: A folder for videos of the first episodes, with their first frames as PNG files beside them. Files of the
+                same names are replaced, and those of an earlier evaluation with more videos stay. `swm report` shows videos in
+                the folder of the saved results, or below.
             dataset: The dataset of starts and goals: a `swm.data.Dataset`, its path, URI or name.
             episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
             goal_offset: The number of steps from a start to its goal; 25 for `None`.
@@ -764,7 +775,7 @@ class World:
         policy = self._chosen(policy)
         picks = None
         if dataset is not None:
-            dataset = str(getattr(dataset, "path", dataset))
+            dataset = _stored_path(dataset)
             goal_offset = 25 if goal_offset is None else _options.count("goal_offset", goal_offset)
             eval_budget = 50 if eval_budget is None else _options.count("eval_budget", eval_budget)
             if (episodes_idx is None) != (start_steps is None):
@@ -774,6 +785,8 @@ class World:
                 episodes = len(picks)
         elif episodes_idx is not None or start_steps is not None or goal_offset is not None:
             raise ValueError("episodes_idx, start_steps, goal_offset: they select rows of a dataset; pass dataset=…")
+        if videos is not None and video is None:
+            raise ValueError("videos: no folder is named; pass video=… as well")
         episodes = 50 if episodes is None else _options.count("episodes", episodes)
         hold = _options.count("hold", hold)
         variation = _options.variation(_without_states(options), self.spec["variation"])
@@ -792,7 +805,7 @@ class World:
         if floor and acting[0][0] != "random":
             acting.append(("random", _engine.Actor.random(self._world, None)))
         # Before the episodes, because they may change the policy and the wrappers.
-        manifest = evaluation_manifest(self, policy, config, [name for name, _ in acting], dataset)
+        manifest = evaluation_manifest(self, policy, config, acting, dataset)
         runs: list[dict[str, Any]] = []
         folder = None
         try:
@@ -852,6 +865,27 @@ def _literal(value: Any) -> Any:
     return repr(value)
 
 
+def _stored_path(dataset: Any) -> str:
+    """The path, URI or name of a dataset whose rows evaluations start from."""
+    path = getattr(dataset, "path", dataset)
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(
+            f"dataset: {type(dataset).__name__}; expected a dataset of swm.data.load_dataset, or its path, URI or name: "
+            "evaluations start from rows of one stored dataset"
+        )
+    from ..data.dataset import StoredDataset
+    from ..data.foreign import ROWS, check_overrides
+    from ..data.utils import resolve
+
+    check_overrides("World.evaluate", dataset, "write what it returns into a dataset, and pass that one", ROWS)
+    if isinstance(dataset, StoredDataset):
+        # The evaluation opens the path again, where there may be another dataset by now.
+        dataset.check_unchanged()
+    text = os.fspath(path)
+    # A dataset of this machine counts before one of the hub. Results name the commit of the latter.
+    return resolve(text) if text.startswith("lerobot://") else _engine.pinned_dataset(text)
+
+
 def _random_seed() -> int:
     """A random seed of 32 bits."""
     return secrets.randbits(32)
@@ -861,9 +895,7 @@ def _seed(seed: int | None) -> int:
     """The seed, or a random one for `None`."""
     if seed is None:
         return _random_seed()
-    if int(seed) != seed or not 0 <= seed < 2**63:
-        raise ValueError(f"seed: {seed}; expected an integer from 0 to 2^63 - 1")
-    return int(seed)
+    return _options.count("seed", seed, least=0)
 
 
 def _joined(seeds: Sequence[int]) -> int:
@@ -888,7 +920,7 @@ def _check_storable(space: spaces.Space[Any]) -> None:
             )
 
 
-def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any]]) -> Callable[[], Any]:
+def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any, int]]) -> Callable[[], Any]:
     """A reference to a policy, at whose end its actor leaves `actors`: an actor may hold a model of gigabytes."""
     key = id(policy)
 

@@ -60,6 +60,11 @@ impl Results {
         if is_other {
             return Err("it states another environment, protocol, counting or seed than its request".to_owned());
         }
+        let budget = requested("budget").and_then(serde_json::Value::as_u64).unwrap_or(u64::MAX);
+        let mut episodes = self.runs.iter().flat_map(|run| &run.episodes);
+        if let Some(episode) = episodes.find(|episode| episode.steps as u64 > budget) {
+            return Err(format!("it has an episode of {} steps, and its budget is {budget}", episode.steps));
+        }
         // The name of the floor is the name of a policy.
         let policies = requested("policies").and_then(|policies| policies.as_array());
         let is_false_floor = |policy: &&serde_json::Value| {
@@ -204,6 +209,7 @@ fn close(stated: &[f64], computed: &[f64]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::results::{EpisodeResult, Timing};
     use serde_json::json;
 
     #[test]
@@ -216,5 +222,20 @@ mod tests {
         of(json!("random")).expect("the floor");
         let error = of(json!("no-op")).expect_err("another policy");
         assert!(error.contains("'random' is another one by its request: \"no-op\""), "{error}");
+    }
+
+    #[test]
+    fn episodes_are_no_longer_than_their_budget() {
+        let episodes = [3, 7].map(|steps| EpisodeResult { steps, ..EpisodeResult::default() });
+        let mut results = Results::default();
+        let run = Run::new("in distribution", "expert", results.counting, episodes.into(), Timing::default());
+        results.runs.push(run);
+        for (budget, is_right) in [(json!(7), true), (json!(null), true), (json!(6), false)] {
+            results.manifest.config = json!({ "budget": budget });
+            let checked = results.check();
+            assert_eq!(checked.is_ok(), is_right, "{budget}: {checked:?}");
+        }
+        let error = results.check().expect_err("a longer episode");
+        assert!(error.contains("an episode of 7 steps, and its budget is 6"), "{error}");
     }
 }

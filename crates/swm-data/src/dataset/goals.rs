@@ -54,7 +54,7 @@ impl Default for GoalMixture {
 }
 
 /// Goals to load with every clip. They become the columns `NAME_COLUMN` (`[1, shape…]`) and `NAME_offset`: the number
-/// of rows from the anchor to the goal, or -1 if the goal is not a later row of the same episode.
+/// of rows from the anchor to the goal: 0 for the anchor itself, and -1 for an earlier row or one of another episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GoalSpec {
@@ -75,7 +75,7 @@ pub(crate) struct Goal {
     pub episode: usize,
     /// Row of the goal within the episode.
     pub row: usize,
-    /// Number of rows from the anchor to the goal; -1 if the goal does not follow the anchor.
+    /// Number of rows from the anchor to the goal; -1 for an earlier row or one of another episode.
     pub offset: i64,
 }
 
@@ -103,10 +103,10 @@ impl GoalSpec {
                 expected: "at least 0 and below 1".to_owned(),
             });
         }
-        if self.anchor.is_some_and(|anchor| anchor >= clip.num_steps) {
+        if let Some(anchor) = self.anchor.filter(|anchor| *anchor >= clip.num_steps) {
             return Err(Error::OutOfSpace {
                 what: format!("the anchor of '{}'", self.name),
-                given: format!("{:?}", self.anchor),
+                given: anchor.to_string(),
                 expected: format!("a step of the clip, below {}", clip.num_steps),
             });
         }

@@ -378,7 +378,8 @@ class Loose(gymnasium.Env):
         success = successes.get(self.value, False)
         ends = {'end-nan': float('nan'), 'end-text': 'False', 'end-none': None, 'end-minus': -1}
         ends |= {'missing': True, 'success-gone': True}
-        reward = '1' if self.value == 'reward' else 0.0
+        rewards = {'reward': '1', 'reward-none': None, 'reward-pair': np.zeros(2), 'reward-one': np.ones(1)}
+        reward = rewards.get(self.value, 0.0)
         info = {} if self.value == 'missing' else {'success': success}
         return observation, reward, ends.get(self.value, False), False, info
 

@@ -99,6 +99,8 @@ fn observations_of_another_shape_or_type_are_errors() {
             ("end-none", "terminated is None"),
             ("end-minus", "terminated is -1"),
             ("reward", "the reward is '1'"),
+            ("reward-none", "the reward is None: return a number"),
+            ("reward-pair", "the reward is array([0., 0.]): return a number"),
         ])
     {
         let mut env = make(&format!("tests.it.environments:Loose-v0,value={value}"), &config);
@@ -113,6 +115,10 @@ fn observations_of_another_shape_or_type_are_errors() {
     for _ in 0..3 {
         env.step(Action::Discrete(&[0])).expect("a leading axis of one element is left out");
     }
+    let mut env = make("tests.it.environments:Loose-v0,value=reward-one", &config);
+    env.reset(0, &ResetOptions::default()).expect("a reset");
+    let rewards = [0, 1].map(|_| env.step(Action::Discrete(&[0])).expect("an array of one element").reward);
+    assert_eq!(rewards, [0.0, 1.0]);
 }
 
 #[test]

@@ -341,7 +341,7 @@ pub fn name(device: &Device) -> String {
 /// Returns the name of a device in the manifest of what is computed from an artifact whose manifest names the device `before`:
 /// imported models name the CPU without the backend, and what is computed from them on the CPU does so as well.
 pub fn name_after(device: &Device, before: &str) -> String {
-    if is_cpu(device) && before.starts_with("cpu") { before.to_owned() } else { name(device) }
+    if is_cpu(device) && before == "cpu" { before.to_owned() } else { name(device) }
 }
 
 #[cfg(test)]
@@ -376,8 +376,9 @@ mod tests {
 
     #[test]
     fn results_name_the_device_that_computed_them() {
-        let names = ["cpu", "cpu (flex)", "vulkan: a GPU"].map(|before| name_after(&Device::flex(), before));
-        assert_eq!(names, ["cpu", "cpu (flex)", "cpu (flex)"]);
+        let names =
+            ["cpu", "cpu (flex)", "cpu (torch)", "vulkan: a GPU"].map(|before| name_after(&Device::flex(), before));
+        assert_eq!(names, ["cpu", "cpu (flex)", "cpu (flex)", "cpu (flex)"]);
     }
 
     #[test]

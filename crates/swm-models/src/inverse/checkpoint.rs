@@ -54,7 +54,13 @@ impl InverseCheckpoint {
     /// folder does not hold the world model.
     pub fn load(stored: &StoredCheckpoint, device: &Device) -> Result<Self> {
         let config: InverseConfig = stored.config(FAMILY)?;
-        let world_model = Checkpoint::<Lewm>::load(&stored.run().join(WORLD_MODEL), device)?;
+        let world_model = Checkpoint::<Lewm>::of(&stored.world_model()?, device)?;
+        let expected = stored.manifest().hashes.get("encoder");
+        if expected.is_some_and(|hash| hash != world_model.hash()) {
+            let problem =
+                format!("{WORLD_MODEL} is not the world model with which this network was trained: the hash differs");
+            return Err(stored.broken(problem));
+        }
         config.check()?;
         let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
         let create = |init: &Init| Ok(Mlp::new(init, 2 * latent, config.hidden, action_dim));

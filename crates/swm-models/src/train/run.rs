@@ -79,6 +79,21 @@ pub fn begin<M: Trainable>(
     let inputs = Inputs::of(config, &*reader, options)?;
     let _lock = Lock::folder(out)?;
     let (learner, loader) = inputs.learner(config, out, options)?;
+    let settings = config.loop_config();
+    let part = |part| {
+        let batches = batches(&settings, loader.clone(), part, &*reader)?;
+        // Refuses what no loader can load, before there is a checkpoint.
+        let loaded = Loader::new(Arc::clone(&reader), batches.clone()).map(|_| batches);
+        loaded.map_err(|error| match part {
+            Part::Train => error,
+            _ => {
+                let fix = "collect more episodes, lower data.batch_size, or leave validation out (validation.every=0)";
+                Error::config("the episodes of validation", error.to_string(), fix)
+            }
+        })
+    };
+    let training = part(Part::Train)?;
+    let validation = if settings.validation.every > 0 { Some(part(Part::Validation)?) } else { None };
     if !Checkpoint::<M>::exists(out) {
         resume::check_new_run(out)?;
         record()?;
@@ -87,14 +102,9 @@ pub fn begin<M: Trainable>(
         checkpoint::restore_old(out)?;
         remove_later_steps(out, learner.state().step)?;
     }
-    let settings = config.loop_config();
-    let part = |part| batches(&settings, loader.clone(), part, &*reader);
     let names = parameters::shapes(learner.model()).into_keys();
-    Ok(TrainingPlan {
-        parameters: names.map(|name| (name.clone(), M::parameter_group(&name))).collect(),
-        training: part(Part::Train)?,
-        validation: if settings.validation.every > 0 { Some(part(Part::Validation)?) } else { None },
-    })
+    let parameters = names.map(|name| (name.clone(), M::parameter_group(&name))).collect();
+    Ok(TrainingPlan { parameters, training, validation })
 }
 
 /// What a training loop outside this program needs besides the checkpoint from which a run begins.

@@ -49,7 +49,7 @@ pub fn curves_svg(metric: &str, over: &str, trainings: &[(String, Vec<(f64, f64)
         curves,
         description,
     };
-    Ok(plot::draw(&panel)?.svg)
+    plot::svg(&panel)
 }
 
 /// Draws the curve of one metric of a training log; `None` for fewer than two points.

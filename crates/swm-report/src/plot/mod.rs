@@ -95,17 +95,23 @@ pub(crate) struct Drawing {
 /// # Errors
 /// When drawing fails, which is a bug.
 pub(crate) fn draw(figure: &impl Figure) -> Result<Drawing> {
-    let inline = inline(figure)?;
+    Ok(Drawing { inline: inline(figure)?, svg: svg(figure)?, png: png(figure)? })
+}
+
+/// Draws a figure as an SVG file.
+///
+/// # Errors
+/// When drawing fails, which is a bug.
+pub(crate) fn svg(figure: &impl Figure) -> Result<String> {
     let [width, height] = size(figure, Layout::Wide);
-    let svg = format!(
+    Ok(format!(
         "<svg width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {} {}\" xmlns=\"http://www.w3.org/2000/svg\">\n\
          <title>{}</title>\n<rect width=\"100%\" height=\"100%\" fill=\"#FFFFFF\"/>\n{}</svg>\n",
         units(width),
         units(height),
         description(figure),
         elements(figure, Layout::Wide)?.0
-    );
-    Ok(Drawing { inline, svg, png: png(figure)? })
+    ))
 }
 
 /// Draws a figure for a page: an element for each layout.

@@ -8,9 +8,9 @@ use super::progress::control;
 use super::results_tables::summary;
 use super::run_record;
 use super::wrappers::WrapperArgs;
-use super::{Context, emit, emit_json};
+use super::{Context, emit, emit_json, eprint};
 use super::{eval_until, output_folder};
-use crate::resolver::HomeResolver;
+use crate::resolver::{HomeResolver, warning_of_starts};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -184,6 +184,11 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     let resolver = if args.trace { resolver.tracing() } else { resolver };
     let request = args.request(&resolver, CapsuleStarts::Use)?;
     args.check_planning(&request)?;
+    if let StartsRequest::Dataset { dataset, .. } = &request.starts
+        && let Some(warning) = warning_of_starts(dataset, &request.env)
+    {
+        eprint(&format!("warning: {warning}\n"));
+    }
     // Before the work: only a traced evaluation replaces the traces.
     if args.trace {
         drop(output_folder::claim(&args.output, &[TRACES])?);

@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use swm_core::columns::{REWARD, SUCCESS, is_stored_as};
 use swm_core::results::Summary;
+use swm_core::text::one_line;
 use swm_core::{Error, Manifest, Result};
 use swm_data::{Reader, StepRange, checksum, column_stats, frequent_colours};
 use swm_models::capsule::Capsule;
@@ -89,7 +90,7 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
         let range = contents["ranges"].get(&column.name);
         let value = |key: &str| range.map_or_else(String::new, |range| short(&range[key]));
         vec![
-            column.name.clone(),
+            one_line(&column.name),
             format!("{}{}", column.dtype.name(), shape(&column.shape)),
             value("min"),
             value("mean"),
@@ -102,13 +103,13 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     let columns = reader.schema().columns();
     let others = footprint.iter().filter(|(part, _)| !columns.iter().any(|column| stored(part, &column.name)));
     for (part, size) in others {
-        emit(&format!("{part}: {}\n", bytes(*size)));
+        emit(&format!("{}: {}\n", one_line(part), bytes(*size)));
     }
     for name in reader.unread() {
-        emit(&format!("not read, because it is neither numbers nor images: {name}\n"));
+        emit(&format!("not read, because it is neither numbers nor images: {}\n", one_line(&name)));
     }
     for (name, size) in constants(&*reader)? {
-        emit(&format!("constant of every episode: {name}, {} in the first episode\n", bytes(size)));
+        emit(&format!("constant of every episode: {}, {} in the first episode\n", one_line(&name), bytes(size)));
     }
     emit(&provenance(reader.manifest().as_ref()));
     emit(&format!("content hash: {}\n", contents["content_hash"].as_str().unwrap_or_default()));

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from ... import _engine
+from ... import _engine, _options
 from ..._overrides import engine_part
 from ..adapter import Adapter
 from .callbacks import Callback
@@ -69,7 +69,8 @@ class EngineSolver:
         model = cost if model is None else model
         #: The callbacks, which run after every iteration.
         self.callbacks = list(callbacks or ())
-        self.model, self.batch_size, self.device, self.seed = model, batch_size, device, int(seed)
+        self.model, self.batch_size, self.device = model, batch_size, device
+        self.seed = _options.count("seed", seed, least=0)
         known = _defaults()[self.id]
         self.settings: dict[str, Any] = {}
         #: Arguments of the constructor that are no settings of the engine.
@@ -166,7 +167,11 @@ class EngineSolver:
                 "solve: the simulator needs the environments, and solve gets infos only; "
                 "use MPCPolicy, with a solver of this package"
             )
+        if not isinstance(info_dict, Mapping):
+            raise TypeError(f"info_dict: expected a dict of arrays (B, T, ..), got {type(info_dict).__name__}")
         infos = {key: value for key, value in info_dict.items() if not isinstance(value, (list, str))}
+        if not infos:
+            raise ValueError(f"info_dict: {sorted(info_dict)}; expected at least one array (B, T, ..)")
         envs = len(next(iter(infos.values())))
         if isinstance(model, Adapter):
             model.set_infos(info_dict, envs)
@@ -336,6 +341,8 @@ def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float
         return [], [], [int(space.n)] * block
     if isinstance(space, spaces.MultiDiscrete):
         return [], [], [int(n) for n in space.nvec.reshape(-1)] * block
+    if not hasattr(space, "low"):
+        raise TypeError(f"action_space: {space}; planners choose actions of Box, Discrete and MultiDiscrete spaces")
     low, high = (np.asarray(side, dtype=np.float32).reshape(-1) for side in (space.low, space.high))
     info, scaler = getattr(model, "info", None), ACTION_SCALER.get()
     if info is not None:

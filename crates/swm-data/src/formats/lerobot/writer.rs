@@ -189,7 +189,8 @@ impl LerobotWriter {
             if !column.is_image() {
                 let start = stored.len();
                 stored.extend(bytes);
-                if column.name == ACTION {
+                // Types without a value for a missing action have one in the last row.
+                if column.name == ACTION && !matches!(column.dtype, DType::Bool | DType::U8) {
                     repeat_last(&mut stored[start..], column.row_bytes());
                 }
                 let values = as_f64(column, &stored[start..]);

@@ -26,7 +26,7 @@ try:
     import rerun.blueprint as rrb
     import numpy as np
 
-    rr.EncodedImage.columns, rr.Scalars.columns
+    rr.EncodedImage.columns, rr.Scalars.columns, rr.escape_entity_path_part
 except (ImportError, AttributeError) as error:
     print("missing:", str(error).replace("\n", " "), file=answers)
     sys.exit(1)
@@ -40,7 +40,7 @@ def steps(fields):
 def series(path, fields, values):
     """Adds values as lines over the steps, one for each element."""
     values = values.reshape(fields["rows"], -1).astype(np.float64)
-    name = path.rsplit("/", 1)[1]
+    name = fields["column"]
     names = [name] if values.shape[1] == 1 else [f"{name}[{index}]" for index in range(values.shape[1])]
     recording.log(path, rr.SeriesLines(names=names), static=True)
     recording.send_columns(path, steps(fields), columns=rr.Scalars.columns(scalars=values))
@@ -74,7 +74,7 @@ def text(episode, facts):
 recording = rr.RecordingStream("stable-worldmodel", recording_id=opening["name"])
 recording.save(opening["file"])
 recording.send_recording_name(opening["name"])
-episode, tabs, shown = "", [], {}
+episode, tabs, shown, columns_of = "", [], {}, {}
 while True:
     fields, data = message()
     if fields["kind"] == "end":
@@ -85,7 +85,9 @@ while True:
         tabs.append(episode)
         shown[episode] = {"images": [], "series": []}
         continue
-    path = f"{episode}/{fields['column']}"
+    # Two names that differ in a sign of paths are two entities.
+    path = f"{episode}/{rr.escape_entity_path_part(fields['column'])}"
+    columns_of[path] = fields["column"]
     views = shown[episode]["series" if fields["kind"] == "values" else "images"]
     if path not in views and (fields["plotted"] or fields["kind"] != "values"):
         views.append(path)
@@ -98,8 +100,8 @@ while True:
 # A tab for each episode: frames and what is known about it on the left, values over the steps on the right.
 layouts = []
 for name in tabs:
-    cameras = [rrb.Spatial2DView(origin=path, name=path.rsplit("/", 1)[1]) for path in shown[name]["images"]]
-    plots = [rrb.TimeSeriesView(origin=path, name=path.rsplit("/", 1)[1]) for path in shown[name]["series"]]
+    cameras = [rrb.Spatial2DView(origin=path, name=columns_of[path]) for path in shown[name]["images"]]
+    plots = [rrb.TimeSeriesView(origin=path, name=columns_of[path]) for path in shown[name]["series"]]
     about = rrb.TextDocumentView(origin=f"{name}/about", name="about")
     left = rrb.Vertical(rrb.Grid(*cameras), about, row_shares=[2, 1]) if cameras else about
     layouts.append(rrb.Horizontal(left, rrb.Vertical(*plots), name=name) if plots else left)

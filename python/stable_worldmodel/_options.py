@@ -19,13 +19,13 @@ def count(name: str, value: Any, least: int = 1) -> int:
         ValueError: When it is no whole number, or is out of range. The engine's counts have 63 bits.
     """
     try:
-        whole = not isinstance(value, (bool, np.bool_)) and int(value) == value and least <= int(value)
+        whole = not isinstance(value, (bool, np.bool_)) and int(value) == value
+        fits = whole and least <= int(value) < 1 << 63
     except (TypeError, ValueError, OverflowError):
-        whole = False
-    if not whole:
-        raise ValueError(f"{name}: {value!r}; expected a whole number of at least {least}")
-    if int(value) >= 1 << 63:
-        raise ValueError(f"{name}: {value!r}; expected a whole number below 2^63")
+        whole = fits = False
+    if not fits:
+        bound = " and below 2^63" if whole and int(value) >= 1 << 63 else ""
+        raise ValueError(f"{name}: {value!r}; expected a whole number of at least {least}{bound}")
     return int(value)
 
 

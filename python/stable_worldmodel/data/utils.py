@@ -152,7 +152,7 @@ def _options(
 ) -> str:
     if mode not in ("resume", "append", "overwrite", "error"):
         raise ValueError(f"mode: expected 'resume', 'append', 'overwrite' or 'error', got {mode!r}")
-    chosen = codec_json(codec, quality)
+    chosen = codec_json(codec, quality, format)
     settings = {
         "format": format,
         "mode": mode,

@@ -21,8 +21,16 @@ from .format import validate_write_mode
 __all__ = ["EpisodeWriter"]
 
 
-def codec_json(codec: str | None, quality: int | None = None) -> str | None:
-    """The image codec as JSON for the engine: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg-QUALITY"`."""
+#: The formats that store images without loss, whatever the codec: those without `codecs` in the engine's registry.
+_LOSSLESS = ("hdf5",)
+
+
+def codec_json(codec: str | None, quality: int | None = None, format: str | None = None) -> str | None:
+    """The image codec as JSON for the engine: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg-QUALITY"`.
+
+    Raises:
+        ValueError: If it is none of these, or JPEG for a format that stores images without loss.
+    """
     if codec is None:
         if quality is None:
             return None
@@ -31,6 +39,8 @@ def codec_json(codec: str | None, quality: int | None = None) -> str | None:
         raise TypeError(f"codec: expected 'qoi', 'png' or 'jpeg-QUALITY', got {codec!r}")
     name, _, given = codec.lower().replace(":", "-").partition("-")
     name = {"lossless": "qoi", "jpg": "jpeg"}.get(name, name)
+    if name == "jpeg" and format in _LOSSLESS:
+        raise ValueError(f"codec: the format {format} stores images without loss; leave it out, or choose another format")
     if name == "jpeg" and (not given or given.isdigit()):
         return json.dumps({"jpeg": {"quality": int(given or (95 if quality is None else quality))}})
     if name not in ("qoi", "png") or given:
@@ -72,7 +82,7 @@ class EpisodeWriter:
         self.path = _engine.target(os.fspath(path), self.format)
         if self.format is None:
             self.format = _engine.detect(self.path) or "lance"
-        self._codec = codec_json(codec, jpeg_quality)
+        self._codec = codec_json(codec, jpeg_quality, self.format)
         self._manifest = None if manifest is None else self._provenance(manifest)
         #: Held while an episode is written, because the first one opens the dataset.
         self._lock = threading.RLock()

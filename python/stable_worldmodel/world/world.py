@@ -613,7 +613,8 @@ class World:
             the finished episodes remain stored.
         """
         path = dataset_path if path is None else path
-        path = None if path is None else os.fspath(path)
+        # Formats of the user get the path as it is given.
+        given, path = path, None if path is None else os.fspath(path)
         if (path is None) == (writer is None):
             raise ValueError("World.collect: expected either a path or a writer")
         if mode not in ("error", "overwrite", "append", "resume"):
@@ -631,11 +632,11 @@ class World:
         if writer is None and format is None:
             format = _FORMAT_OF_SUFFIX.get(Path(path or "").suffix)
         first = 0
-        if path is not None and writer is None and format not in _engine.formats():
+        if path is not None and given is not None and writer is None and format not in _engine.formats():
             from ..data.format import foreign_episodes, foreign_writer
 
-            first = foreign_episodes(path, format, mode)
-            writer = foreign_writer(path, format, mode)
+            first = foreign_episodes(given, format, mode)
+            writer = foreign_writer(given, format, mode)
         if codec is not None and writer is not None:
             raise ValueError(
                 "codec: the writer decides how frames are stored; leave codec out, or pass a path of another format"
@@ -703,10 +704,11 @@ class World:
     ) -> dict[str, int]:
         from ..data.writer import codec_json
 
+        stored_as = codec_json(codec, format=format)
         try:
             with _progress.bar("collect", config["episodes"], progress) as bar:
                 outcome = self._world.collect(
-                    self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
+                    self._playing(policy), path, writer, format, mode, stored_as, json.dumps(config), bar
                 )
         finally:
             self._end_interactive_loop()

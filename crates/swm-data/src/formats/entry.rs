@@ -5,7 +5,6 @@ use crate::dataset::{Location, Reader, WriteMode, WriteOptions, Writer};
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Error, Named, Result, Schema, files};
-use swm_image::ImageCodec;
 
 /// A dataset format: its id, its suffixes, and the functions that detect, open and create its datasets.
 pub struct FormatEntry {
@@ -76,13 +75,8 @@ impl FormatEntry {
     ///
     /// # Errors
     /// If the dataset exists and `options.mode` forbids it, the dataset to replace is a symbolic link or the path a link to nothing, the schema differs
-    /// from that of the dataset to continue, the codec is JPEG and the format stores images without loss, writing fails, or this build lacks
-    /// the format's feature.
+    /// from that of the dataset to continue, writing fails, or this build lacks the format's feature.
     pub fn create(&self, location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
-        if let (false, ImageCodec::Jpeg { .. }) = (self.codecs, options.codec) {
-            let problem = format!("the format {} stores images without loss", self.id);
-            return Err(Error::config("codec jpeg", problem, "leave it out, or choose another format"));
-        }
         if let Some(path) = location.path() {
             // A link to nothing would place the files where the user may not expect them.
             if options.mode == WriteMode::Overwrite || !path.exists() {

@@ -67,7 +67,7 @@ fn error_of_the_package_is_one_line() {
     let swm = rooms();
     let package = swm.path("packages/rerun");
     std::fs::create_dir_all(&package).expect("a folder");
-    let fails = "class EncodedImage: columns = None\nclass Scalars: columns = None\n\
+    let fails = "class EncodedImage: columns = None\nclass Scalars: columns = None\nescape_entity_path_part = str\n\
                  def RecordingStream(*args, **kwargs): raise OSError('no space left')\n";
     std::fs::write(package.join("__init__.py"), fails).expect("a package");
     std::fs::write(package.join("blueprint.py"), "").expect("a package");

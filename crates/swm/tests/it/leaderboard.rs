@@ -115,7 +115,9 @@ fn forged_rewards_time_limits_weights_and_versions_are_refused() {
         swm.fails(&["leaderboard", "verify", name], code, parts);
     };
     refused("reward.json", 1, &["does not hold"], &|entry| entry.results.runs[2].episodes[1].total_reward += 1e-9);
-    refused("budget.json", 1, &["does not hold"], &|entry| entry.results.manifest.config["budget"] = 11.into());
+    refused("longer.json", 1, &["does not hold"], &|entry| entry.results.manifest.config["budget"] = 13.into());
+    let shorter = ["an episode of 12 steps, and its budget is 11"];
+    refused("shorter.json", 1, &shorter, &|entry| entry.results.manifest.config["budget"] = 11.into());
     refused("weights.json", 2, &["its hash is", "restore"], &|entry| change_hash(entry, "weights of pldm"));
     let version: &dyn Fn(&mut Entry) = &|entry| entry.results.manifest.swm_version += "9";
     refused("version.json", 2, &["was made with stable-worldmodel"], version);
@@ -241,7 +243,8 @@ fn edited_files_and_files_that_are_no_entries_are_refused() {
     fs::remove_dir_all(swm.path("found")).expect("removing the results");
     let own = fs::read_to_string(swm.path("entry.json")).expect("the entry");
     for (content, what) in [
-        (own.replacen("\"steps\": ", "\"steps\": 1", 1), "was edited"),
+        (own.replacen("\"total_reward\": ", "\"total_reward\": 1", 1), "was edited"),
+        (own.replacen("\"steps\": ", "\"steps\": 100", 1), "and its budget is 12"),
         (own.replacen("\"version\": 1", "\"version\": 2", 1), "layout 2"),
         (own.replacen("\"author\"", "\"who\"", 1), "unknown field"),
         // Fields that reading leaves out, so that the hash holds.

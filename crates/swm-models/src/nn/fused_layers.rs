@@ -33,8 +33,6 @@ pub(super) struct HiddenParameters {
     pub shift: Tensor<1>,
     /// The value that the normalisation adds to the variance.
     pub epsilon: f64,
-    /// The number of leading inputs that are constants of the graph: their gradients are 0 instead of computed.
-    pub constants: usize,
 }
 
 /// Computes a hidden layer on the CPU: `x Wᵀ + b`, dropout, layer normalisation, Mish. `mask`, which may be empty, holds the factors of
@@ -43,10 +41,10 @@ pub(super) struct HiddenParameters {
 /// # Shapes
 /// `x` is `[rows, inputs]`, `mask` `[rows, outputs]`; returns `[rows, outputs]`.
 pub(super) fn hidden(x: Tensor<2>, parameters: HiddenParameters, mask: Vec<f32>) -> Tensor<2> {
-    let HiddenParameters { weight, bias, scale, shift, epsilon, constants } = parameters;
+    let HiddenParameters { weight, bias, scale, shift, epsilon } = parameters;
     let (x, weight) = (x.into_dispatch(), weight.into_dispatch());
     let [bias, scale, shift] = [bias, scale, shift].map(Tensor::into_dispatch);
-    Tensor::from_dispatch(<Dispatch as Layers>::hidden(x, weight, bias, scale, shift, mask, epsilon, constants))
+    Tensor::from_dispatch(<Dispatch as Layers>::hidden(x, weight, bias, scale, shift, mask, epsilon))
 }
 
 /// The operations of this file. Only the CPU has them.
@@ -64,7 +62,6 @@ trait Layers: Backend {
         shift: FloatTensor<Self>,
         mask: Vec<f32>,
         epsilon: f64,
-        constants: usize,
     ) -> FloatTensor<Self>;
 }
 
@@ -87,7 +84,6 @@ impl Layers for Flex {
         shift: FloatTensor<Self>,
         mask: Vec<f32>,
         epsilon: f64,
-        _: usize,
     ) -> FloatTensor<Self> {
         let layer = norm_mish([bias, scale, shift], epsilon);
         let mut y = product(&x, &weight);
@@ -116,16 +112,13 @@ impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
         shift: FloatTensor<Self>,
         mask: Vec<f32>,
         epsilon: f64,
-        constants: usize,
     ) -> FloatTensor<Self> {
         let ((x, of_x), (weight, of_weight), (bias, of_bias)) =
             (x.into_parts(), weight.into_parts(), bias.into_parts());
         let ((scale, of_scale), (shift, of_shift)) = (scale.into_parts(), shift.into_parts());
         let nodes = [of_x, of_weight, of_bias, of_scale, of_shift];
         match HiddenGradient.prepare::<C>(nodes).compute_bound().stateful() {
-            OpsKind::UnTracked(prepared) => {
-                prepared.finish(Flex::hidden(x, weight, bias, scale, shift, mask, epsilon, 0))
-            }
+            OpsKind::UnTracked(prepared) => prepared.finish(Flex::hidden(x, weight, bias, scale, shift, mask, epsilon)),
             OpsKind::Tracked(prepared) => {
                 let (x, weight) = (x.to_contiguous(), weight.to_contiguous());
                 let layer = norm_mish([bias, scale, shift], epsilon);
@@ -135,7 +128,7 @@ impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
                 let tape = NormMishTape { standard: &mut *standard, slopes: &mut *slopes, factors: &mut *factors };
                 layer.apply_recorded(&mask, &mut y, tape);
                 let tape = NormMishTape { standard, slopes, factors };
-                prepared.finish(Arc::new(HiddenTape { x, weight, layer, mask, tape, constants }), rows(y, features))
+                prepared.finish(Arc::new(HiddenTape { x, weight, layer, mask, tape }), rows(y, features))
             }
         }
     }
@@ -159,7 +152,7 @@ impl Backward<Flex, 3> for LinearGradient {
             functions::add_rows(&mut sum, &d);
             gradients.register::<Flex>(parent.id, vector(sum));
         }
-        register_product(gradients, [of_x, of_weight].map(|parent| parent.map(|parent| parent.id)), &d, &x, &weight, 0);
+        register_product(gradients, [of_x, of_weight].map(|parent| parent.map(|parent| parent.id)), &d, &x, &weight);
     }
 }
 
@@ -171,7 +164,6 @@ struct HiddenTape {
     layer: NormMish,
     mask: Vec<f32>,
     tape: NormMishTape<Vec<f32>>,
-    constants: usize,
 }
 
 /// The backward pass of [`hidden`]: gradients of inputs, weights, bias, scale and shift.
@@ -182,7 +174,7 @@ impl Backward<Flex, 5> for HiddenGradient {
     type State = Arc<HiddenTape>;
 
     fn backward(self, ops: Ops<Self::State, 5>, gradients: &mut Gradients, _: &mut Checkpointer) {
-        let HiddenTape { x, weight, layer, mask, tape, constants } = &*ops.state;
+        let HiddenTape { x, weight, layer, mask, tape } = &*ops.state;
         let mut d = values(gradients.consume::<Flex>(&ops.node));
         let tape = NormMishTape { standard: &*tape.standard, slopes: &*tape.slopes, factors: &*tape.factors };
         let of_vectors = layer.backward(mask, &tape, &mut d);
@@ -192,19 +184,17 @@ impl Backward<Flex, 5> for HiddenGradient {
                 gradients.register::<Flex>(parent.id, vector(gradient));
             }
         }
-        let parents = [of_x, of_weight].map(|parent| parent.map(|parent| parent.id));
-        register_product(gradients, parents, &d, x, weight, *constants);
+        register_product(gradients, [of_x, of_weight].map(|parent| parent.map(|parent| parent.id)), &d, x, weight);
     }
 }
 
-/// Registers the gradients of `x` and `weight`, whose product `x Wᵀ` has the gradient `d`; 0 for the first `constants` columns of `x`.
+/// Registers the gradients of `x` and `weight`, whose product `x Wᵀ` has the gradient `d`.
 fn register_product(
     gradients: &mut Gradients,
     [of_x, of_weight]: [Option<burn::backend::autodiff::NodeId>; 2],
     d: &[f32],
     x: &FloatTensor<Flex>,
     weight: &FloatTensor<Flex>,
-    constants: usize,
 ) {
     let [outputs, inputs] = weight.shape().dims();
     let d = Matrix::new(d, outputs);
@@ -213,20 +203,7 @@ fn register_product(
         gradients.register::<Flex>(id, rows(gradient, inputs));
     }
     if let Some(id) = of_x {
-        let weight = elements(weight);
-        let gradient = if constants == 0 {
-            multiply(d, Matrix::new(weight, inputs))
-        } else {
-            let others: Vec<f32> = weight.chunks_exact(inputs).flat_map(|row| &row[constants..]).copied().collect();
-            let width = inputs - constants;
-            let of_others = multiply(d, Matrix::new(&others, width));
-            let mut gradient = vec![0.0; x.shape().num_elements()];
-            for (row, of_others) in gradient.chunks_exact_mut(inputs).zip(of_others.chunks_exact(width)) {
-                row[constants..].copy_from_slice(of_others);
-            }
-            gradient
-        };
-        gradients.register::<Flex>(id, rows(gradient, inputs));
+        gradients.register::<Flex>(id, rows(multiply(d, Matrix::new(elements(weight), inputs)), inputs));
     }
 }
 
@@ -317,7 +294,7 @@ mod tests {
             let inputs = [&x, &weight, &vectors[0], &vectors[1], &vectors[2]];
             let parameters = |change: fn(Tensor<2>) -> Tensor<2>| {
                 let [bias, scale, shift] = vectors.clone().map(|vector| change(vector).squeeze_dim(0));
-                HiddenParameters { weight: change(weight.clone()), bias, scale, shift, epsilon: 1e-5, constants: 0 }
+                HiddenParameters { weight: change(weight.clone()), bias, scale, shift, epsilon: 1e-5 }
             };
             let found = derivatives(hidden(x.clone(), parameters(|tensor| tensor), mask.clone()), &inputs);
             let factors = if mask.is_empty() { vec![1.0; 11 * 37] } else { mask.clone() };
@@ -329,14 +306,8 @@ mod tests {
             // The same outside a graph, and with parameters that need no gradient.
             let constants = parameters(|tensor| tensor.inner());
             assert_eq!(host(hidden(x.clone().inner(), constants, mask.clone())), found[0]);
-            let frozen = || parameters(|tensor| tensor.inner().autodiff());
-            let of_x = hidden(x.clone(), frozen(), mask.clone());
+            let of_x = hidden(x.clone(), parameters(|tensor| tensor.inner().autodiff()), mask);
             assert_eq!(derivatives(of_x, &[&x])[1], found[1]);
-            // The first four inputs are constants.
-            let of_x = derivatives(hidden(x.clone(), HiddenParameters { constants: 4, ..frozen() }, mask), &[&x]);
-            let others: Vec<f32> = found[1].iter().enumerate().map(|(i, d)| if i % 6 < 4 { 0.0 } else { *d }).collect();
-            assert_eq!(of_x[0], found[0]);
-            assert_close(&of_x[1..], &[others]);
         }
     }
 }

@@ -48,16 +48,16 @@ impl NormalizedLinear {
     /// # Shapes
     /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn hidden(&self, x: Tensor<2>) -> Tensor<2> {
-        self.hidden_with_dropout(x, 0.0, &mut DropoutRng::disabled(), 0)
+        self.hidden_with_dropout(x, 0.0, &mut DropoutRng::disabled())
     }
 
-    /// As [`NormalizedLinear::hidden`], with dropout after the matrix product. The first `constants` inputs need no gradient.
-    fn hidden_with_dropout(&self, x: Tensor<2>, rate: f32, noise: &mut DropoutRng<'_>, constants: usize) -> Tensor<2> {
+    /// As [`NormalizedLinear::hidden`], with dropout after the matrix product.
+    fn hidden_with_dropout(&self, x: Tensor<2>, rate: f32, noise: &mut DropoutRng<'_>) -> Tensor<2> {
         let (weight, bias, norm) = (self.weight.val(), self.bias.val(), &self.ln);
         if has_kernels(&x) {
             let mask = noise.mask(x.dims()[0] * bias.dims()[0], rate).unwrap_or_default();
             let (scale, shift, epsilon) = (norm.weight.val(), norm.bias.val(), norm.epsilon());
-            return fused_layers::hidden(x, HiddenParameters { weight, bias, scale, shift, epsilon, constants }, mask);
+            return fused_layers::hidden(x, HiddenParameters { weight, bias, scale, shift, epsilon }, mask);
         }
         mish(norm.forward(noise.dropout(x.matmul(weight.transpose()) + bias.unsqueeze(), rate)))
     }
@@ -136,8 +136,6 @@ pub struct Ensemble {
     heads: Vec<Head>,
     /// The layers of all heads; `None` on the CPU.
     layers: Option<[Layer; 3]>,
-    /// The number of leading inputs that need no gradient.
-    constants: usize,
 }
 
 /// One layer of all heads: weights `[heads, inputs, outputs]`; bias, scale and shift `[heads, 1, outputs]`.
@@ -166,14 +164,12 @@ impl Ensemble {
             };
             [hidden(|head| &head._0), hidden(|head| &head._1), last]
         });
-        Self { heads: heads.iter().map(|head| (*head).clone()).collect(), layers, constants: 0 }
+        Self { heads: heads.iter().map(|head| (*head).clone()).collect(), layers }
     }
 
-    /// Returns heads that are outside a graph as constants of a graph: gradients flow through them to the inputs, but not to the heads.
-    /// The first `constants` inputs are constants as well.
+    /// Returns heads that are outside a graph as constants of a graph: gradients flow through them to the input, but not to the heads.
     #[must_use]
-    pub fn frozen(mut self, constants: usize) -> Self {
-        self.constants = constants;
+    pub fn frozen(mut self) -> Self {
         self.heads = self.heads.into_iter().map(|head| head.train().no_grad()).collect();
         let freeze = |tensor: &mut Tensor<3>| *tensor = tensor.clone().inner().autodiff();
         for Layer { weight, bias, norm } in self.layers.iter_mut().flatten() {
@@ -190,7 +186,7 @@ impl Ensemble {
     pub fn forward(&self, x: Tensor<2>, dropout: f32, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let Some([first, second, last]) = &self.layers else {
             let outputs = self.heads.iter().map(|Head { _0, _1, _2 }| {
-                _2.forward_fused(_1.hidden(_0.hidden_with_dropout(x.clone(), dropout, noise, self.constants)))
+                _2.forward_fused(_1.hidden(_0.hidden_with_dropout(x.clone(), dropout, noise)))
             });
             return Tensor::stack(outputs.collect(), 0);
         };

@@ -310,10 +310,9 @@ fn evaluate_policy(model: &Tdmpc2, shard: &Shard, latents: &Tensor<2>, draws: &D
     let normal = (noise.square() * -0.5 - 0.5 * (2.0 * std::f64::consts::PI).ln()).autodiff() - gaussian.log_std;
     let squashed = (activation::relu(actions.clone().square().neg() + 1.0) + 1e-6).log();
     let entropy = (normal - squashed).sum_dim(1).squeeze_dim(1) * -(width as f64);
-    let [_, latent] = latents.dims();
     let input = Tensor::cat(vec![latents, actions], 1);
     let means = (0..shard.horizon).map(|step| {
-        let critics = Ensemble::of(&chosen(&model.qs, draws.policy_critics[step])).frozen(latent);
+        let critics = Ensemble::of(&chosen(&model.qs, draws.policy_critics[step])).frozen();
         let logits = critics.forward(shard.at(&input, step), 0.0, &mut DropoutRng::disabled());
         expected_values(model.config().bins, logits).mean_dim(0).squeeze_dim(0)
     });

@@ -149,7 +149,7 @@ Policy = BasePolicy
 class _EnginePolicy(BasePolicy):
     """A policy that acts inside the engine."""
 
-    #: How often its settings changed: worlds make a new actor then.
+    #: How often its settings changed: a `World` makes a new actor then.
     _changes = 0
 
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:

@@ -659,15 +659,15 @@ def test_a_world_keeps_no_policy_that_nobody_else_keeps():
 
 
 def test_a_changed_seed_reaches_every_world_of_a_policy():
-    worlds, policy = [rooms(num_envs=1, add_pixels=False) for _ in range(2)], swm.policy.RandomPolicy(seed=1)
+    both, policy = [rooms(num_envs=1, add_pixels=False) for _ in range(2)], swm.policy.RandomPolicy(seed=1)
 
     def first_actions():
-        for world in worlds:
+        for world in both:
             world.reset(seed=0)
             world.step()
-        return [world.infos["action"].tolist() for world in worlds]
+        return [world.infos["action"].tolist() for world in both]
 
-    for world in worlds:
+    for world in both:
         world.set_policy(policy)
     before = first_actions()
     policy.set_seed(5)

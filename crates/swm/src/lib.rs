@@ -24,6 +24,7 @@ pub mod home;
 pub mod leaderboard;
 mod library;
 mod metadata;
+pub mod recorded_env;
 mod remote_checkpoint;
 pub mod resolver;
 pub mod step_subject;

@@ -1,6 +1,5 @@
-//! [`HomeResolver`] loads the environments, wrappers, solvers, datasets and checkpoints that an evaluation request
-//! names. Environments, wrappers and solvers belong to this build; datasets and checkpoints are in the [home
-//! folder](crate::home).
+//! [`HomeResolver`] loads the environments, wrappers, solvers, datasets and checkpoints that an evaluation request names.
+//! Environments, wrappers and solvers belong to this build; datasets and checkpoints are in the [home folder](crate::home).
 
 mod probing;
 mod watching;
@@ -437,28 +436,6 @@ pub fn direct(
         Error::config(format!("checkpoint {given}"), problem, "plan with it (`swm eval` does)")
     })??;
     Ok((policy, info))
-}
-
-/// Returns a warning if a dataset was recorded in another environment than the one that starts from its rows, whose states may mean
-/// something else. A dataset that cannot be opened has none: that is an error of the evaluation.
-pub fn warning_of_starts(dataset: &str, env: &str) -> Option<String> {
-    let manifest = home::open_dataset(dataset).ok()?.manifest()?;
-    let recorded = manifest.config["env"].as_str()?;
-    (simulator(recorded) != simulator(env))
-        .then(|| format!("{dataset} was collected in {recorded}, and its states are starts in {env} here"))
-}
-
-/// Returns the id of an environment without its module, settings and version, and without the words for variants of actions,
-/// observations and rewards, which share a simulator.
-fn simulator(env: &str) -> String {
-    let id = env.split(',').next().unwrap_or_default().rsplit(':').next().unwrap_or_default();
-    let name = match id.rsplit_once("-v") {
-        Some((name, version)) if version.bytes().all(|byte| byte.is_ascii_digit()) => name,
-        _ => id,
-    };
-    ["-Discrete", "Discrete", "Dense", "Sparse", "Dict"]
-        .iter()
-        .fold(name.to_owned(), |name, word| name.replace(word, ""))
 }
 
 /// Returns an untrained policy: `random`, `expert` (the environment's first expert), or an expert by its id.

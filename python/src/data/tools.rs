@@ -179,7 +179,7 @@ pub fn find_dataset(py: Python<'_>, path: &str) -> PyResult<String> {
 /// A warning if a dataset was recorded in another environment than the one that starts from its rows.
 #[pyfunction]
 pub fn warning_of_starts(py: Python<'_>, dataset: &str, env: &str) -> PyResult<Option<String>> {
-    exit::detached(py, || Ok(swm::resolver::warning_of_starts(dataset, env))).map_err(to_py_err)
+    exit::detached(py, || Ok(swm::recorded_env::warning_of_starts(dataset, env))).map_err(to_py_err)
 }
 
 /// The URI of a dataset of a hub with the commit that it has now; another URI, path or name unchanged.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import os
 import re
 import warnings
@@ -109,7 +110,7 @@ class Dataset:
         if "action" in sample:
             action = sample["action"]
             # The width is stated, because there may be no steps.
-            sample["action"] = action.reshape(steps, self.frameskip * int(np.prod(action.shape[1:])))
+            sample["action"] = action.reshape(steps, self.frameskip * math.prod(action.shape[1:]))
         return sample
 
     def load_chunk(

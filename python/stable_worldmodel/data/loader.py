@@ -199,13 +199,14 @@ class Loader:
         num_steps = num_steps if num_steps is not None else getattr(dataset, "num_steps", 1)
         frameskip = frameskip if frameskip is not None else getattr(dataset, "frameskip", 1)
         self.num_steps, self.frameskip = _options.whole("num_steps", num_steps), _options.whole("frameskip", frameskip)
+        self._shuffle = bool(shuffle)
         settings = {
             "num_steps": self.num_steps,
             "frameskip": self.frameskip,
             "columns": [*columns, _EPISODE] if self._adds_episodes else [*columns],
             "goals": [goal.spec() for goal in given],
             "batch_size": self.batch_size,
-            "shuffle": bool(shuffle),
+            "shuffle": self._shuffle,
             "seed": self.seed,
             "drop_last": bool(drop_last),
             "rank": _options.whole("rank", rank),
@@ -270,7 +271,7 @@ class Loader:
     def state_dict(self) -> dict[str, int]:
         """The position of the iteration, for :meth:`load_state_dict`."""
         epoch, batch = self._at
-        settings = {name: int(json.loads(self._settings)[name]) for name in ("num_steps", "frameskip", "shuffle")}
+        settings = {"num_steps": self.num_steps, "frameskip": self.frameskip, "shuffle": int(self._shuffle)}
         position = {"epoch": epoch, "batch": batch}
         return {**position, "seed": self.seed, "batch_size": self.batch_size, "clips": self.num_clips, **settings}
 

@@ -3,7 +3,9 @@
 use super::geometry::{Geometry, Phase};
 use crate::Panels;
 use crate::functions::add_rows;
+use crate::panels::LANES;
 use crate::product::{Columns, Rows, Segment, multiply};
+use rayon::prelude::*;
 
 /// The number of rows of a product at which the layer processes no further image together with the others: weights are
 /// read once per block, and the maps of a block must fit into a core's cache.
@@ -60,28 +62,34 @@ impl Layer {
         let taps = kernel.pow(2);
         let (all_inputs, all_outputs) = (self.geometry.inputs, self.geometry.outputs);
         let mut matrix = vec![0.0; taps * all_inputs * all_outputs];
-        let weights = || weight.chunks_exact(taps).enumerate().map(|(row, taps)| (row / inputs, row % inputs, taps));
-        for (output, input, values) in weights() {
-            for (tap, value) in values.iter().enumerate() {
-                matrix[(tap * all_inputs + input) * all_outputs + output] = *value;
+        // Rows are filled in groups, so that the weights of neighbouring inputs are read together.
+        matrix.par_chunks_mut(LANES * all_outputs).enumerate().for_each(|(group, rows)| {
+            for (output, weights) in weight.chunks_exact(inputs * taps).enumerate() {
+                for (row, values) in rows.chunks_exact_mut(all_outputs).enumerate() {
+                    let (tap, input) = ((group * LANES + row) / all_inputs, (group * LANES + row) % all_inputs);
+                    if input < inputs {
+                        values[output] = weights[input * taps + tap];
+                    }
+                }
             }
-        }
+        });
         self.forward.fill_rows(self.geometry.patch(), (&matrix, all_outputs));
         self.forward.set_bias(bias);
         if self.phases.is_empty() {
             return;
         }
         matrix.fill(0.0);
-        for (output, input, values) in weights() {
-            for (tap, value) in values.iter().enumerate() {
-                matrix[(tap * all_outputs + output) * all_inputs + input] = *value;
+        matrix.par_chunks_mut(all_inputs).enumerate().for_each(|(row, values)| {
+            let (tap, output) = (row / all_outputs, row % all_outputs);
+            if let Some(weights) = weight.chunks_exact(inputs * taps).nth(output) {
+                values.iter_mut().zip(weights.chunks_exact(taps)).for_each(|(value, weights)| *value = weights[tap]);
             }
-        }
+        });
         let by_tap = |tap: usize| &matrix[tap * all_outputs * all_inputs..][..all_outputs * all_inputs];
         for (phase, panels) in self.phases.iter().zip(&mut self.backward) {
             let [ys, xs] = &phase.taps;
             let taps = ys.iter().flat_map(|y| xs.iter().map(move |x| y * kernel + x));
-            let rows: Vec<f32> = taps.flat_map(|tap| by_tap(tap).iter().copied()).collect();
+            let rows: Vec<f32> = taps.map(by_tap).collect::<Vec<_>>().concat();
             panels.fill_rows(rows.len() / all_inputs, (&rows, all_inputs));
         }
     }
@@ -137,14 +145,16 @@ impl Layer {
     pub fn gradients(&self, sums: &[f32]) -> [Vec<f32>; 2] {
         let ([inputs, outputs], taps) = (self.channels, self.geometry.kernel.pow(2));
         let mut weight = vec![0.0; outputs * inputs * taps];
-        for (row, values) in sums.chunks_exact(self.geometry.outputs).enumerate().take(self.geometry.patch()) {
-            let (tap, input) = (row / self.geometry.inputs, row % self.geometry.inputs);
-            if input < inputs {
-                for (output, value) in values[..outputs].iter().enumerate() {
-                    weight[(output * inputs + input) * taps + tap] = *value;
+        weight.par_chunks_mut(LANES * inputs * taps).enumerate().for_each(|(group, weight)| {
+            let rows = sums.chunks_exact(self.geometry.outputs).enumerate().take(self.geometry.patch());
+            for (row, values) in rows {
+                let (tap, input) = (row / self.geometry.inputs, row % self.geometry.inputs);
+                if input < inputs {
+                    let weight = weight.chunks_exact_mut(inputs * taps).zip(&values[group * LANES..]);
+                    weight.for_each(|(weight, value)| weight[input * taps + tap] = *value);
                 }
             }
-        }
+        });
         [weight, sums[self.geometry.patch() * self.geometry.outputs..][..outputs].to_vec()]
     }
 }

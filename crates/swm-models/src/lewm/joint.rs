@@ -141,7 +141,7 @@ pub(crate) fn step(
             })
             .collect();
         let shards = shards.into_iter().map(|shard| parameters::prefixed(ENCODER, shard));
-        shards.for_each(|shard| parameters::add(&mut gradients, shard));
+        parameters::add_all(&mut gradients, shards.collect());
     }
     JointStep { prediction: prediction.error, decoding, gradients, all, buffers }
 }

@@ -10,9 +10,7 @@ use burn::tensor::Tensor;
 use rand_distr::{Distribution as _, StandardNormal};
 use rayon::prelude::*;
 use swm_core::Key;
-
-/// The largest argument of the characteristic functions.
-const LAST_KNOT: f32 = 3.0;
+use swm_kernels::{EppsPulley, Statistics};
 
 /// The lower bound of the length of a latent difference in [`straightening`].
 const LENGTH_EPSILON: f64 = 1e-8;
@@ -46,99 +44,35 @@ pub fn directions(key: Key, dim: usize, count: usize) -> Vec<f32> {
     all
 }
 
-/// The trapezoidal rule over the arguments (knots) of the characteristic functions, from 0 to [`LAST_KNOT`].
-struct Quadrature {
-    /// The distance between neighbouring knots.
-    spacing: f32,
-    /// The characteristic function of the standard normal distribution at each knot.
-    target: Vec<f32>,
-    /// The weight of each knot: the trapezoidal weights of the knot and of the negated knot, times the Gaussian window.
-    weights: Vec<f32>,
-}
-
-impl Quadrature {
-    fn new(knots: usize) -> Self {
-        let spacing = LAST_KNOT / (knots as f32 - 1.0);
-        let target: Vec<f32> = (0..knots).map(|k| (-(k as f32 * spacing).powi(2) / 2.0).exp()).collect();
-        let weights =
-            (0..knots).map(|k| target[k] * spacing * if k == 0 || k == knots - 1 { 1.0 } else { 2.0 }).collect();
-        Self { spacing, target, weights }
-    }
-
-    /// Returns the Epps-Pulley statistic of samples and the derivatives of the statistic with respect to the samples.
-    fn statistic(&self, samples: impl ExactSizeIterator<Item = f32>) -> (f64, Vec<f32>) {
-        let Self { spacing, target, weights } = self;
-        let (knots, n) = (target.len(), samples.len() as f32);
-        let (mut cos, mut sin) = (vec![0.0f32; knots], vec![0.0f32; knots]);
-        let turns: Vec<(f32, f32)> = samples
-            .map(|sample| {
-                let (s, c) = (sample * spacing).sin_cos();
-                let (mut re, mut im) = (1.0f32, 0.0f32);
-                for k in 0..knots {
-                    cos[k] += re;
-                    sin[k] += im;
-                    (re, im) = (re * c - im * s, re * s + im * c);
-                }
-                (c, s)
-            })
-            .collect();
-        let mut statistic = 0.0f64;
-        // Derivatives of the statistic with respect to the sums of cosines and sines, times the knot.
-        let (mut by_cos, mut by_sin) = (vec![0.0f32; knots], vec![0.0f32; knots]);
-        for k in 0..knots {
-            let (real, imaginary) = (cos[k] / n - target[k], sin[k] / n);
-            statistic += f64::from(weights[k] * (real * real + imaginary * imaginary) * n);
-            let knot = k as f32 * spacing;
-            by_cos[k] = 2.0 * weights[k] * real * knot;
-            by_sin[k] = 2.0 * weights[k] * imaginary * knot;
-        }
-        let gradient = turns
-            .iter()
-            .map(|&(c, s)| {
-                let (mut re, mut im, mut sum) = (1.0f32, 0.0f32, 0.0f32);
-                for k in 0..knots {
-                    sum += by_sin[k] * re - by_cos[k] * im;
-                    (re, im) = (re * c - im * s, re * s + im * c);
-                }
-                sum
-            })
-            .collect();
-        (statistic, gradient)
-    }
-}
-
 /// Computes the Epps-Pulley statistic, `n ∫ |φ_n(t) - exp(-t²/2)|² exp(-t²/2) dt` averaged over steps and directions,
 /// and the gradient of the average with respect to the latents.
 ///
 /// # Shapes
 /// `latents` is `[batch, steps, dim]`, `directions` is `[count, dim]`; the gradient has the shape of the latents.
 pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], knots: usize) -> (f64, Vec<f32>) {
-    let batch = latents.len() / (steps * dim);
     let count = directions.len() / dim;
-    let quadrature = Quadrature::new(knots);
+    let rule = EppsPulley::new(knots);
+    let groups: Vec<&[f32]> = directions.chunks(EppsPulley::DIRECTIONS * dim).collect();
 
-    // Every task returns the statistic of one step and direction and the gradient of the projections, so that the sums
+    // Every task returns the statistics of one step and some directions and the gradient of the projections, so that the sums
     // below have the same order on any number of threads.
-    let tasks: Vec<(f64, Vec<f32>)> = (0..steps * count)
+    let tasks: Vec<Statistics> = (0..steps * groups.len())
         .into_par_iter()
         .map(|task| {
-            let (step, direction) = (task / count, &directions[task % count * dim..][..dim]);
-            quadrature.statistic((0..batch).map(|row| {
-                let latent = &latents[(row * steps + step) * dim..][..dim];
-                latent.iter().zip(direction).map(|(a, b)| a * b).sum()
-            }))
+            let (step, group) = (task / groups.len(), groups[task % groups.len()]);
+            rule.statistics(&latents[step * dim..], steps * dim, group, dim)
         })
         .collect();
 
     let factor = 1.0 / (steps * count) as f32;
-    let value = tasks.iter().map(|(statistic, _)| statistic).sum::<f64>() * f64::from(factor);
+    let value = tasks.iter().flat_map(|task| task.values).sum::<f64>() * f64::from(factor);
     let mut gradient = vec![0.0f32; latents.len()];
     gradient.par_chunks_mut(dim).enumerate().for_each(|(index, row)| {
         let (sample, step) = (index / steps, index % steps);
-        for direction in 0..count {
-            let slope = tasks[step * count + direction].1[sample] * factor;
-            for (to, component) in row.iter_mut().zip(&directions[direction * dim..][..dim]) {
-                *to += slope * component;
+        for (task, group) in tasks[step * groups.len()..].iter().zip(&groups) {
+            for (slope, direction) in task.slopes[sample].iter().zip(group.chunks_exact(dim)) {
+                let slope = slope * factor;
+                row.iter_mut().zip(direction).for_each(|(to, component)| *to += slope * component);
             }
         }
     });

@@ -80,7 +80,7 @@ pub(super) fn predict(model: &Lewm, windows: &Windows, shards: usize, mut noise:
             (gradient(&shard.latents, &mut all), parameters::gradients(&shard.model, &all))
         })
         .unzip();
-    shards.into_iter().for_each(|shard| parameters::add(&mut gradients, shard));
+    parameters::add_all(&mut gradients, shards);
     Prediction {
         error: f64::from(value),
         gradients,

@@ -5,8 +5,7 @@
 
 use super::model::Encoder;
 use crate::nn::kernels::{batch_statistics, conv_parameters, named_conv_gradients, named_vit_gradients, vit_gradient};
-use crate::nn::parameters::host;
-use crate::nn::parameters::{self, Named};
+use crate::nn::parameters::{self, HostValues, Named};
 use crate::nn::{BatchStatistics, Conv};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -58,8 +57,8 @@ pub(crate) struct Shard {
 
 enum BackwardState {
     Burn(Box<(Encoder, Tensor<2>)>),
-    Vit { patches: Vec<f32>, tapes: Vec<Tape> },
-    Conv { pixels: Vec<f32>, network: Box<ConvGradient> },
+    Vit { patches: HostValues, tapes: Vec<Tape> },
+    Conv { pixels: HostValues, network: Box<ConvGradient> },
 }
 
 impl Shard {
@@ -77,7 +76,7 @@ impl Shard {
                 Self { features: features.inner(), statistics, state }
             }
             Differentiation::Vit(vit) => {
-                let (patches, mut scratch) = (host(patches), vit.scratch());
+                let (patches, mut scratch) = (HostValues::of(&patches), vit.scratch());
                 let (features, tapes): (Vec<_>, Vec<_>) =
                     patches.chunks_exact(count * width).map(|image| vit.forward(image, &mut scratch)).unzip();
                 let features = TensorData::new(features.concat(), [images, vit.dim()]);
@@ -85,7 +84,7 @@ impl Shard {
                 Self { features: Tensor::from_data(features, &device), statistics: vec![], state }
             }
             Differentiation::Conv(conv) => {
-                let (pixels, mut network) = (host(patches), conv.kernels(count.isqrt()));
+                let (pixels, mut network) = (HostValues::of(&patches), conv.kernels(count.isqrt()));
                 network.load(&conv_parameters(conv));
                 let features = network.forward(&pixels);
                 let features = TensorData::new(features, [images, network.dim()]);
@@ -112,7 +111,7 @@ impl Shard {
         match (self.state, differentiation) {
             (BackwardState::Vit { patches, tapes }, Differentiation::Vit(vit)) => {
                 let (mut sums, mut scratch) = (vit.sums(), vit.scratch());
-                let gradient = host(gradient);
+                let gradient = HostValues::of(&gradient);
                 let images = patches.chunks_exact(patches.len() / tapes.len().max(1)).zip(&tapes);
                 for ((image, tape), gradient) in images.zip(gradient.chunks_exact(vit.dim())) {
                     vit.backward(image, tape, gradient, &mut sums, &mut scratch);
@@ -120,7 +119,7 @@ impl Shard {
                 tensors(named_vit_gradients(vit.gradients(sums)))
             }
             (BackwardState::Conv { pixels, mut network }, Differentiation::Conv(conv)) => {
-                let gradients = network.backward(&pixels, &host(gradient));
+                let gradients = network.backward(&pixels, &HostValues::of(&gradient));
                 conv.return_kernels(network);
                 tensors(named_conv_gradients(gradients))
             }

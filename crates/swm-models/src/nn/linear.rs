@@ -41,7 +41,7 @@ impl Linear {
         Self { weight: init.normal("weight", [outputs, inputs], std), bias: Some(init.constant([outputs], 0.0)) }
     }
 
-    /// Applies the layer; all leading axes are rows of one matrix product.
+    /// Applies the layer, on the CPU as one operation; all leading axes are rows of one matrix product.
     ///
     /// # Shapes
     /// Maps `[…, inputs]` to `[…, outputs]`.
@@ -50,22 +50,12 @@ impl Linear {
         let mut shape = x.dims();
         let rows = shape[..D - 1].iter().product::<usize>();
         shape[D - 1] = outputs;
-        let mut y = matmul(x.reshape([rows, inputs]), self.weight.val().transpose());
-        if let Some(bias) = &self.bias {
-            y = y + bias.val().unsqueeze();
-        }
-        y.reshape(shape)
-    }
-
-    /// Applies the layer as one operation, on the CPU. The last bits of a gradient can be others than those of
-    /// [`Linear::forward`].
-    ///
-    /// # Shapes
-    /// Maps `[rows, inputs]` to `[rows, outputs]`.
-    pub fn forward_fused(&self, x: Tensor<2>) -> Tensor<2> {
-        match &self.bias {
+        let x = x.reshape([rows, inputs]);
+        let y = match &self.bias {
             Some(bias) if has_kernels(&x) => fused_layers::linear(x, self.weight.val(), bias.val()),
-            _ => self.forward(x),
-        }
+            Some(bias) => matmul(x, self.weight.val().transpose()) + bias.val().unsqueeze(),
+            None => matmul(x, self.weight.val().transpose()),
+        };
+        y.reshape(shape)
     }
 }

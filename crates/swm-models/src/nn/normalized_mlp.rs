@@ -96,7 +96,7 @@ impl Head {
     /// # Shapes
     /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        self._2.forward_fused(self._1.hidden(self._0.hidden(x)))
+        self._2.forward(self._1.hidden(self._0.hidden(x)))
     }
 }
 
@@ -185,9 +185,10 @@ impl Ensemble {
     /// Maps `[rows, inputs]` to `[heads, rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>, dropout: f32, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let Some([first, second, last]) = &self.layers else {
-            let outputs = self.heads.iter().map(|Head { _0, _1, _2 }| {
-                _2.forward_fused(_1.hidden(_0.hidden_with_dropout(x.clone(), dropout, noise)))
-            });
+            let outputs = self
+                .heads
+                .iter()
+                .map(|Head { _0, _1, _2 }| _2.forward(_1.hidden(_0.hidden_with_dropout(x.clone(), dropout, noise))));
             return Tensor::stack(outputs.collect(), 0);
         };
         let [heads, _, _] = first.weight.dims();

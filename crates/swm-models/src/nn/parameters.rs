@@ -5,6 +5,7 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{BackendTensor, DispatchTensorKind, Flex};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::Deref;
 
@@ -165,13 +166,17 @@ fn blend_on_host(old: Tensor<1>, new: &Tensor<1>, weights: [f32; 2]) -> Tensor<1
 
 /// Adds tensors to sums, by name.
 pub(crate) fn add(sums: &mut Named<Tensor<1>>, terms: Named<Tensor<1>>) {
-    for (name, term) in terms {
-        let sum = match sums.remove(&name) {
-            Some(sum) => sum + term,
-            None => term,
-        };
-        sums.insert(name, sum);
+    add_all(sums, vec![terms]);
+}
+
+/// Adds tensors to sums, by name: those of the first element of `terms` first. Names are added in parallel.
+pub(crate) fn add_all(sums: &mut Named<Tensor<1>>, terms: Vec<Named<Tensor<1>>>) {
+    let mut all: Named<Vec<Tensor<1>>> = Named::new();
+    for (name, term) in terms.into_iter().flatten() {
+        all.entry(name).or_insert_with_key(|name| sums.remove(name).into_iter().collect()).push(term);
     }
+    let added = all.into_par_iter().filter_map(|(name, terms)| Some((name, terms.into_iter().reduce(|a, b| a + b)?)));
+    sums.extend(added.collect::<Vec<_>>());
 }
 
 /// Returns values under the names of a module's submodule `prefix`.

@@ -109,8 +109,8 @@ impl Actor {
     /// # Shapes
     /// `observations` is `[rows, inputs]`; returns `[rows, action_dim]` twice.
     pub fn forward(&self, observations: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
-        let hidden = relu(self.latent_pi._2.forward_fused(relu(self.latent_pi._0.forward_fused(observations))));
-        (self.mu.forward_fused(hidden.clone()), self.log_std.forward_fused(hidden).clamp(-20.0, 2.0))
+        let hidden = relu(self.latent_pi._2.forward(relu(self.latent_pi._0.forward(observations))));
+        (self.mu.forward(hidden.clone()), self.log_std.forward(hidden).clamp(-20.0, 2.0))
     }
 
     /// Samples actions with standard normal `noise`.
@@ -140,6 +140,6 @@ impl Critics {
 
 impl Critic {
     fn forward(&self, x: Tensor<2>) -> Tensor<1> {
-        self._4.forward_fused(relu(self._2.forward_fused(relu(self._0.forward_fused(x))))).squeeze_dim(1)
+        self._4.forward(relu(self._2.forward(relu(self._0.forward(x))))).squeeze_dim(1)
     }
 }

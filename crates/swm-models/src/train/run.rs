@@ -17,6 +17,7 @@ use super::step_output::StepOutput;
 use super::trainable::Trainable;
 use crate::checkpoint::{self, Checkpoint};
 use crate::nn::parameters;
+use rayon::prelude::*;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -313,7 +314,7 @@ impl<'a> Run<'a> {
         let output = self.learner.loss_and_gradients(batch, key, true)?;
         let not_finite = if !output.loss().is_finite() {
             "the loss"
-        } else if output.gradients.values().any(|g| !g.clone().sum().into_scalar::<f32>().is_finite()) {
+        } else if output.gradients.par_iter().any(|(_, g)| !g.clone().sum().into_scalar::<f32>().is_finite()) {
             "the gradient of the loss"
         } else {
             return Ok(output);

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import warnings
 from functools import partial
 
 import gymnasium
@@ -232,6 +233,67 @@ def test_native_environments_restore_recorded_states_without_callables(tmp_path)
         one.set_policy(Still())
     plain, wrapped = (one.evaluate(**picks) for one in (world, wrapped))
     assert np.array_equal(plain["steps"], wrapped["steps"])
+
+
+class Timed(gymnasium.Env):
+    """A point whose state has the time as well, which its goal does not."""
+
+    observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.time = 0.0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        (self.at, self.goal), self.time = self.np_random.uniform(-3, 3, (2, 2)), 0.0
+        return self.at, self.info()
+
+    def info(self):
+        return {"state": np.append(self.at, self.time), "goal_state": self.goal, "goal_radius": 0.5, "goal_at": self.goal}
+
+    def step(self, action):
+        self.at, self.time = self.at + action, self.time + 1
+        return self.at, 0.0, False, False, self.info()
+
+    def set_state(self, state):
+        self.at, self.time = np.array(state[:2]), state[2]
+
+    def set_goal_state(self, goal_state):
+        self.goal = np.array(goal_state[:2])
+
+
+class Telling(Timed):
+    def _get_info(self):
+        return self.info()
+
+
+@pytest.mark.parametrize("kind", [Timed, Telling])
+def test_goals_that_the_goal_row_does_not_tell_are_asked_for_or_nan(tmp_path, kind):
+    gymnasium.register("Timed-v0", entry_point=kind, max_episode_steps=9)
+    seen = []
+
+    class Seeing(swm.policy.BasePolicy):
+        def get_action(self, infos, **named):
+            seen.append((infos["goal_state"][0, 0].copy(), infos["goal_radius"][0, 0]))
+            return np.zeros((1, 2), np.float32)
+
+    try:
+        with swm.World("Timed-v0", num_envs=1, add_pixels=False) as world:
+            world.collect(tmp_path / "t.h5", policy=swm.policy.RandomPolicy(), episodes=1, seed=3, progress=False)
+            goal = swm.data.load_dataset(tmp_path / "t.h5", backend="numpy").load_episode(0)["state"][4, :2]
+            picks = {"episodes_idx": [0], "start_steps": [1], "goal_offset": 3, "eval_budget": 2}
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                world.evaluate(policy=Seeing(), dataset=tmp_path / "t.h5", **picks, seed=2, progress=False, floor=False)
+    finally:
+        gymnasium.registry.pop("Timed-v0")
+    warned = [str(warning.message) for warning in caught if "NaN" in str(warning.message)]
+    assert seen[0][1] == 0.5 and np.array_equal(seen[1][0], goal)
+    if kind is Telling:
+        assert not warned and np.array_equal(seen[0][0], goal)
+    else:
+        assert len(warned) == 1 and "'goal_state'" in warned[0] and np.isnan(seen[0][0]).all()
 
 
 class Still(swm.policy.BasePolicy):

@@ -276,6 +276,16 @@ def test_the_state_of_the_optimizer_does_not_depend_on_the_default_type(rooms, t
     assert steps.dtype == torch.float32 and steps[0] == 1001
 
 
+def test_another_default_type_is_refused_before_anything_is_written(rooms, tmp_path):
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(ValueError, match=r"float64.*set_default_dtype"):
+            torch_train("pldm", rooms, tmp_path / "run", SHORT)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("family", ["lewm", "dino_wm", "tdmpc2"])
 def test_the_engine_plans_with_what_torch_trained(family, rooms, swings, tmp_path):
     data, env = (swings, "swm/PendulumControl-v1") if family == "tdmpc2" else (rooms, "swm/TwoRoom-v1")

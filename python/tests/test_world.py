@@ -543,6 +543,17 @@ def test_wrong_arguments_raise_errors_with_the_reason(make, error, words):
         make()
 
 
+def test_a_policy_that_closes_the_world_is_told_so():
+    class Closing(Zero):
+        def get_action(self, infos, **named):
+            world.close()
+            return np.zeros((2, 2), np.float32)
+
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32))
+    with pytest.raises(RuntimeError, match="the world is closed"):
+        world.evaluate(policy=Closing(), episodes=2, seed=0, progress=False)
+
+
 def test_exception_of_a_policy_is_raised_unchanged(tmp_path):
     class Failing(Zero):
         def get_action(self, infos, **kwargs):

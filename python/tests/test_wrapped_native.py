@@ -60,6 +60,61 @@ def test_datasets_have_the_factors_of_their_episodes(world, tmp_path):
     assert all(dataset.load_episode(episode)["goal"].max() > 0 for episode in range(4))
 
 
+def test_seeds_mean_the_same_episodes_as_without_the_wrapper(world, tmp_path):
+    def rows(one, name):
+        one.collect(tmp_path / name, policy=swm.policy.RandomPolicy(seed=1), episodes=2, seed=3, progress=False)
+        dataset = swm.data.load_dataset(tmp_path / name, backend="numpy")
+        return [dataset.load_episode(episode) for episode in range(2)]
+
+    with swm.World(world.env_name, num_envs=2, image_shape=(32, 32)) as plain:
+        for seed in (3, [2**40 + 5, 2**62 - 1]):
+            for one in (world, plain):
+                one.reset(seed=seed)
+            for column in ("state", "goal_state"):
+                assert np.array_equal(world.infos[column], plain.infos[column]), column
+        wrapped, expected = rows(world, "wrapped.h5"), rows(plain, "plain.h5")
+        for one, other in zip(wrapped, expected, strict=True):
+            assert np.array_equal(one["episode_seed"], other["episode_seed"]) and np.array_equal(one["state"], other["state"])
+
+
+class OldGenerator(gymnasium.Wrapper):
+    """Seeds numpy's generator of before 2019, which takes 32 bits."""
+
+    def reset(self, *, seed=None, options=None):
+        self.noise = np.random.RandomState(seed).normal()
+        return self.env.reset(seed=seed, options=options)
+
+
+def test_wrappers_get_seeds_of_32_bits(tmp_path):
+    with swm.World("swm/TwoRoom-v1", num_envs=1, image_shape=(32, 32), extra_wrappers=[OldGenerator]) as world:
+        world.collect(tmp_path / "r.h5", policy=swm.policy.RandomPolicy(), episodes=2, seed=3, progress=False)
+    with swm.World("swm/TwoRoom-v1", num_envs=1, image_shape=(32, 32)) as world:
+        world.collect(tmp_path / "plain.h5", policy=swm.policy.RandomPolicy(), episodes=2, seed=3, progress=False)
+    wrapped, plain = (swm.data.load_dataset(tmp_path / name, backend="numpy").load_episode(1) for name in ("r.h5", "plain.h5"))
+    assert np.array_equal(wrapped["state"], plain["state"])
+
+
+def test_first_infos_of_a_recorded_start_have_the_goal(tmp_path):
+    """Reacher's `goal_state` has another length than its `state`."""
+    firsts = []
+
+    class Seeing(swm.policy.BasePolicy):
+        def get_action(self, infos, **named):
+            firsts[-1].extend(infos["goal_state"][infos["_needs_flush"], 0].tolist())
+            return np.zeros((2, 2), np.float32)
+
+    name, picks = "swm/ReacherDMControl-v0", {"episodes_idx": [0, 1], "start_steps": [2, 5], "goal_offset": 4}
+    with swm.World(name, num_envs=2, image_shape=(32, 32), max_episode_steps=20) as plain:
+        plain.collect(tmp_path / "r.h5", policy=swm.policy.RandomPolicy(), episodes=2, seed=3, progress=False)
+        for extra in ([], [Same]):
+            firsts.append([])
+            with swm.World(name, num_envs=2, image_shape=(32, 32), max_episode_steps=20, extra_wrappers=extra) as world:
+                world.evaluate(
+                    policy=Seeing(), dataset=tmp_path / "r.h5", **picks, eval_budget=3, seed=2, progress=False, floor=False
+                )
+    assert len(firsts[0]) == 2 and np.allclose(firsts[0], firsts[1])
+
+
 def test_time_limit_is_that_of_the_environment(world):
     with swm.World(world.env_name, num_envs=1, image_shape=(32, 32)) as plain:
         assert world.max_episode_steps == plain.max_episode_steps

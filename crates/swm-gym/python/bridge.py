@@ -27,6 +27,7 @@ import math
 import os
 import struct
 import threading
+import warnings
 
 import gymnasium
 import numpy as np
@@ -379,6 +380,9 @@ class Bridge:
         self.size = FORKED_AT + 1
         self.action_at = self.allocate(self.actions.len * self.actions.dtype.itemsize)
         self.columns, self.observed, self.informed = [], [], []
+        # Environments of this package have columns that experts read by name, take seeds of 64 bits, and compute their `info`
+        # at any time.
+        self.native = bool(getattr(env.unwrapped, 'swm_native', False))
         for name, path, space in leaves(env.observation_space, 'observation'):
             form, dtype, shape = described(space)
             if form is not None:
@@ -393,8 +397,8 @@ class Bridge:
             goal = key == 'goal' and values and is_frame(values[0])
             if fixed and not goal and key not in IN_HEADER and not key.startswith('_'):
                 dtype = column_dtype(np.result_type(*values))
-                self.column(names, key, 'info_', dtype, values[0].shape)
-                self.informed.append((key, dtype, values[0].shape, self.columns[-1]['offset']))
+                name = self.column(names, key, 'info_', dtype, values[0].shape)
+                self.informed.append((key, name, dtype, values[0].shape, self.columns[-1]['offset']))
         self.factors_at = self.allocate(8 * sum(len(form['init']) for form, _ in self.factors))
 
         self.no_frame, self.render_shape, self.frame_index = '', None, None
@@ -428,8 +432,7 @@ class Bridge:
         return offset
 
     def column(self, names, name, prefix, dtype, shape):
-        # Experts of a native environment read its columns by their own names.
-        if not getattr(self.env.unwrapped, 'swm_keeps_names', False):
+        if not self.native:
             name = name.replace('/', '_').replace(' ', '_')
         while name in RESERVED or name in names:
             name = prefix + name
@@ -484,6 +487,7 @@ class Bridge:
             'frame': self.render_shape and {'size': self.render_shape, 'offset': self.frame_at},
             'goal': self.goal_shape and {'size': self.goal_shape, 'offset': self.goal_at},
             'no_frame': self.no_frame,
+            'native': self.native,
             'pixel_art': bool(getattr(self.env.unwrapped, 'swm_pixel_art', False)),
             'max_episode_steps': self.max_episode_steps,
             'libraries': self.libraries,
@@ -500,7 +504,7 @@ class Bridge:
 
         self.action = view(self.action_at, self.actions.len, self.actions.dtype)
         self.observed_views = [(path, view(at, shape, dtype)) for path, _, _, dtype, shape, at in self.observed]
-        self.informed_views = {key: view(at, shape, dtype) for key, dtype, shape, at in self.informed}
+        self.informed_views = {key: view(at, shape, dtype) for key, _, dtype, shape, at in self.informed}
         self.frame = self.render_shape and view(self.frame_at, (*self.render_shape, 3), np.uint8)
         self.goal = self.goal_shape and view(self.goal_at, (*self.goal_shape, 3), np.uint8)
         self.factor_views, at = [], self.factors_at
@@ -540,14 +544,16 @@ class Bridge:
         else:
             raise ValueError(f'unknown request {op}')
 
-    def reset(self, seed, variation=None, variation_values=None, recorded=None):
-        """Starts an episode. `variation` and `variation_values` become the `options` of the environment's reset; `recorded`
+    def reset(self, seed, native_seed=None, variation=None, variation_values=None, recorded=None):
+        """Starts an episode. A native environment takes `native_seed` in place of `seed`, which wrappers get. `variation` and `variation_values` become the `options` of the environment's reset; `recorded`
         are the arguments of `set_recorded_state`."""
         options = {}
         if variation is not None:
             options['variation'] = variation
         if variation_values:
             options['variation_values'] = {key: self.value(key, value) for key, value in variation_values.items()}
+        if native_seed is not None:
+            self.env.unwrapped.swm_seed = (seed, native_seed)
         observation, info = self.call(self.env.reset, seed=seed, options=options or None)
         for view in self.informed_views.values():
             view[...] = 0
@@ -562,16 +568,42 @@ class Bridge:
             self.set_recorded_state(**recorded)
         self.write_goal(info)
 
-    def set_recorded_state(self, calls, shown, held):
+    def set_recorded_state(self, calls, shown, held, unknown=()):
         """Sets a recorded state: calls methods of the environment, and writes the recorded values `shown` and `held` into
-        the columns. The values `held` are written again after every step."""
+        the columns. The values `held` are written again after every step. The goal's columns `unknown` take the values that
+        `_get_info()` of the environment has now, as many environments have; without it they become NaN."""
         for call in calls:
             self.call(self.method(call['method']), **{key: argument(value) for key, value in call['args'].items()})
+        info = self.present_info() if unknown else {}
+        for key, name, dtype, shape, _ in self.informed:
+            if name not in unknown:
+                continue
+            value = numeric(info.get(key))
+            if value is not None and value.shape == shape:
+                self.views[name][...] = value
+            elif not self.native and dtype.kind == 'f':
+                self.views[name][...] = math.nan
+                warnings.warn(
+                    f"'{name}' is NaN until the first step: the dataset has its values in another shape, and the environment"
+                    ' has no method _get_info() that returns it',
+                    stacklevel=2,
+                )
         shown, self.held = ([(self.views[name], argument(value)) for name, value in part.items()] for part in (shown, held))
         for view, value in [*shown, *self.held]:
             view[...] = np.reshape(value, view.shape)
         # The header that the reset wrote describes another state.
         HEAD.pack_into(self.buffer, 0, 0.0, math.inf, False, False, False)
+
+    def present_info(self):
+        """The `info` of the present state; empty for an environment that does not tell it."""
+        describe = getattr(self.env.unwrapped, '_get_info', None)
+        try:
+            info = self.call(describe) if callable(describe) else None
+        except Forked:
+            raise
+        except Exception:  # Another method of this name.
+            info = None
+        return info if isinstance(info, dict) else {}
 
     def method(self, name):
         """Finds a method by name in the environment, else in its wrappers, from the outermost to the innermost."""

@@ -3,7 +3,8 @@
 //! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: methods
 //! that the caller names, or methods that the bridge found by their names. These methods return no observation, so the
 //! columns take the values of the start row until the next step. Columns of the goal (`goal_NAME`) take the values of
-//! the goal row in the whole episode.
+//! the goal row in the whole episode; where the goal row has none of their shape, those of the environment's `_get_info()`, and
+//! NaN until the next step if it has no such method.
 
 use crate::EnvLayout;
 use serde_json::{Value, json};
@@ -168,17 +169,21 @@ pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
         made.push(json!({"method": call.method, "args": arguments}));
     }
     let (mut shown, mut held) = (serde_json::Map::new(), serde_json::Map::new());
+    // Columns of the goal that have another shape in the dataset: their values of the reset are of another goal.
+    let mut unknown = vec![];
     for own in &layout.spec.columns {
         let name = flat(&own.name);
         let (row_of, column) = source(&name);
-        let fits =
-            from.start.schema().find(column).is_some_and(|at| from.start.schema().columns()[at].len() == own.len());
-        if let Some(value) = value(&name).filter(|_| fits) {
-            let values = if row_of == Source::Goal { &mut held } else { &mut shown };
-            values.insert(own.name.clone(), value);
+        let stored = from.start.schema().find(column).map(|at| &from.start.schema().columns()[at]);
+        let fits = stored.is_some_and(|stored| stored.len() == own.len());
+        match value(&name).filter(|_| fits) {
+            Some(value) if row_of == Source::Goal => _ = held.insert(own.name.clone(), value),
+            Some(value) => _ = shown.insert(own.name.clone(), value),
+            None if row_of == Source::Goal && (stored.is_some() || layout.is_native()) => unknown.push(&own.name),
+            None => {}
         }
     }
-    Ok(json!({"calls": made, "shown": shown, "held": held}))
+    Ok(json!({"calls": made, "shown": shown, "held": held, "unknown": unknown}))
 }
 
 /// The value of a column in a row as hexadecimal bytes, which preserve every bit.

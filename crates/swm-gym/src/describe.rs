@@ -22,6 +22,9 @@ pub struct Description {
     goal: Option<FrameRegion>,
     no_frame: String,
     pixel_art: bool,
+    /// Whether the environment below the wrappers is one of this package, which takes seeds of 64 bits.
+    #[serde(default)]
+    native: bool,
     /// The time limit, which the user or the environment chose and which may be any value.
     max_episode_steps: serde_json::Value,
     libraries: BTreeMap<String, String>,
@@ -317,6 +320,11 @@ impl EnvLayout {
     /// The versions of the libraries that affect values and frames.
     pub(crate) fn libraries(&self) -> &BTreeMap<String, String> {
         &self.description.libraries
+    }
+
+    /// Whether the environment below the wrappers is one of this package.
+    pub(crate) fn is_native(&self) -> bool {
+        self.description.native
     }
 
     /// The methods that set the state of the environment.

@@ -25,6 +25,9 @@ pub fn reset_arguments(layout: &EnvLayout, seed: u64, options: &ResetOptions) ->
         return Err(Error::config(format!("factors of variation of {id}"), problem, "request no factors"));
     }
     let mut arguments = json!({"seed": fold_seed(seed)});
+    if layout.is_native() {
+        arguments["native_seed"] = json!(seed);
+    }
     if let Some(keys) = variation {
         for key in keys {
             space.select(key)?;

@@ -177,11 +177,16 @@ impl Processes {
         all.iter_mut().find(is_it).ok_or_else(none)?.stop(program)
     }
 
-    /// Stops all processes, and waits for them. One that does not end is killed.
-    pub fn end(&self, program: &dyn Program) {
+    /// Asks all processes to stop.
+    pub fn stop_all(&self, program: &dyn Program) {
         for started in self.lock().iter_mut().filter(|started| started.state == State::Running) {
             started.stop(program).ok();
         }
+    }
+
+    /// Stops all processes, and waits for them. One that does not end is killed.
+    pub fn end(&self, program: &dyn Program) {
+        self.stop_all(program);
         let until = Instant::now() + ENDING;
         while self.lock().iter().any(|started| !started.has_ended()) {
             if Instant::now() >= until {

@@ -112,6 +112,8 @@ impl Server {
             }
             stopping.send_replace(true);
         });
+        // Before all waiting, which a second Ctrl-C ends together with this program.
+        processes.stop_all(&*lab.program);
         drop(router);
         // Requests that read a dataset meanwhile are not waited for.
         runtime.shutdown_timeout(Duration::from_secs(2));

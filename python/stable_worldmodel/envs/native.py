@@ -34,8 +34,11 @@ class NativeEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
-    #: Tells the bridge that the engine chose the names of the columns, which it keeps, such as `goal/xy`.
-    swm_keeps_names = True
+    #: Tells the bridge that the engine chose the names of the columns, such as `goal/xy`, which it keeps, that seeds may have
+    #: 64 bits, and that `_get_info` computes the columns of the current state.
+    swm_native = True
+    #: A seed of the next reset as wrappers get it, and the seed with 64 bits that it stands for.
+    swm_seed: tuple[int, int] | None = None
 
     def __init__(
         self, name: str, render_mode: str | None = "rgb_array", image_shape: tuple[int, int] = (224, 224), **options: Any
@@ -103,6 +106,9 @@ class NativeEnv(gymnasium.Env):
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode. Factors, start and goal depend only on the seed and the options."""
         super().reset(seed=seed)
+        (folded, whole), self.swm_seed = self.swm_seed or (None, None), None
+        if seed is not None and seed == folded:
+            seed = whole
         if seed is None:
             seed = int(self.np_random.integers(2**62))
         columns = self._env.reset(seed, _options.reset(options, self._described["variation"]))

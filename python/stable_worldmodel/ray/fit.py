@@ -25,6 +25,8 @@ __all__ = ["fit", "fitted"]
 
 #: How often the processes are started again after one of them died.
 _RESTARTS = 3
+#: A file in the folder of Ray Train that tells a training of `fit` from other files.
+_MARK = ".swm-fit"
 
 
 def fit(
@@ -70,8 +72,15 @@ def fitted(options: Options, resources: Mapping[str, float] | None = None, wait:
     from .local import connect
 
     run = options.run.resolve()
-    if not options.resume and any((run / name).exists() for name in _engine.CHECKPOINT_FOLDERS):
+    storage = run.with_name(run.name + ".ray")
+    if not options.resume and _holds_checkpoint(run):
         raise ValueError(f"{run}: holds a checkpoint; continue it with resume=true, or choose another folder")
+    # Ray Train takes up what it finds in its folder.
+    mark = storage / "train" / _MARK
+    if mark.parent.exists() and not mark.is_file() and not _holds_checkpoint(run):
+        raise ValueError(
+            f"{mark.parent}: exists, and no training made it; move it away, or choose another folder for the checkpoint"
+        )
     # Processes have another current folder. Their first start is told from a restart by the checkpoint.
     data = str(Path(options.data).resolve()) if Path(options.data).exists() else options.data
     preset = str(Path(options.preset).resolve()) if options.preset and Path(options.preset).is_file() else options.preset
@@ -79,7 +88,8 @@ def fitted(options: Options, resources: Mapping[str, float] | None = None, wait:
     connect()
     asked = _resources(options, resources)
     _wait_for(options.workers, asked, wait)
-    storage = run.with_name(run.name + ".ray")
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    mark.touch()
     refused = storage / f"refused-{uuid.uuid4().hex}.txt"
     trainer = TorchTrainer(
         _rank,
@@ -94,13 +104,17 @@ def fitted(options: Options, resources: Mapping[str, float] | None = None, wait:
     except Exception as error:
         # Errors of Ray Train name its own classes, and the cause last.
         cause = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-        raise RunRefused(
-            f"the training in {run} ended after {_RESTARTS} restarts: {cause}; its last checkpoint is kept, and "
-            f"resume=true continues it"
-        ) from error
+        kept = (
+            "its last checkpoint is kept, and resume=true continues it" if _holds_checkpoint(run) else "it made no checkpoint"
+        )
+        raise RunRefused(f"the training in {run} ended after {_RESTARTS} restarts: {cause}; {kept}") from error
     if refused.exists():
         raise ValueError(refused.read_text(encoding="utf-8"))
     return str(run)
+
+
+def _holds_checkpoint(run: Path) -> bool:
+    return any((run / name).exists() for name in _engine.CHECKPOINT_FOLDERS)
 
 
 def _rank(config: dict[str, Any]) -> None:

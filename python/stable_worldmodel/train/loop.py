@@ -46,6 +46,9 @@ class Trainer:
 
     def __init__(self, options: Options, kind: type[Pretrained] | None = None) -> None:
         self.options, self.run = options, options.run
+        if torch.get_default_dtype() != torch.float32:
+            problem = f"torch's default type is {torch.get_default_dtype()}, in which new modules would be made"
+            raise ValueError(f"{problem}: call torch.set_default_dtype(torch.float32) before the training")
         losses = losses_of(options.family)
         check_kind(options.family, kind)
         self.device = _device(options.device)

@@ -491,6 +491,7 @@ class World:
             )
         get_action = getattr(policy, "get_action", None) or policy.get_actions
         given = get_action(infos)
+        _ = self._world  # An error if the policy has closed the world.
         name = type(policy).__name__
         if given is None:
             raise TypeError(f"{name}.get_action returned None; expected actions of shape {self.envs.action_space.shape}")

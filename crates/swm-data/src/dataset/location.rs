@@ -23,9 +23,9 @@ impl Location {
     /// # Errors
     /// If `given` is a malformed URI, or a URI with an unknown scheme.
     pub fn parse(given: &str) -> Result<Self> {
-        let Some((scheme, rest)) = given.split_once("://") else { return Ok(Self::Path(given.into())) };
+        let Some((scheme, _)) = given.split_once("://") else { return Ok(Self::Path(given.into())) };
         if scheme == "file" {
-            return Ok(Self::Path(rest.into()));
+            return file_of(given).map(Self::Path);
         }
         if !SCHEMES.contains(&scheme) {
             let fix = "use a path, or a URI that begins with s3://, gs://, az://, http:// or https://";
@@ -33,13 +33,26 @@ impl Location {
         }
         // The parser of URIs leaves such characters out, so that another dataset would be meant.
         if given.contains(|c: char| c.is_control()) || given.trim_end() != given {
-            let problem =
-                format!("the URI {given:?} has a line feed, another control character, or a space at its end");
+            let problem = format!(
+                "the URI {:?} has a line feed, another control character, or a space at its end",
+                without_secrets(given)
+            );
             return Err(Error::config("dataset", problem, "leave these characters out"));
         }
+        let named = without_secrets(given);
         let url = Url::parse(given).map_err(|error| {
-            Error::config("dataset", format!("{given} is not a valid URI: {error}"), "check its spelling")
+            Error::config("dataset", format!("{named} is not a valid URI: {error}"), "check its spelling")
         })?;
+        // Names of objects end there for the parser, so that another dataset would be read or replaced. The rest can also be a secret,
+        // which would be in every record of this location.
+        if url.query().is_some() || url.fragment().is_some() {
+            let fix = "leave out what follows, or write %3F and %23 if the name has these characters; signed addresses are not supported";
+            return Err(Error::config("dataset", format!("{named}: it has a '?' or '#'"), fix));
+        }
+        if !url.username().is_empty() || url.password().is_some() {
+            let fix = "leave them out; object stores read credentials from environment variables, web servers get none";
+            return Err(Error::config("dataset", format!("{named}: it has a user name or a password"), fix));
+        }
         Ok(Self::Uri(url))
     }
 
@@ -97,6 +110,35 @@ impl Location {
     /// Whether the name ends in `.suffix`, ignoring case.
     pub fn has_suffix(&self, suffix: &str) -> bool {
         self.name().rsplit_once('.').is_some_and(|(stem, end)| !stem.is_empty() && end.eq_ignore_ascii_case(suffix))
+    }
+}
+
+/// A URI for an error: without a user name, a password, a query and a fragment, which can be secrets.
+fn without_secrets(given: &str) -> String {
+    let named = given.split(['?', '#']).next().unwrap_or_default();
+    match named.split_once("://") {
+        Some((scheme, rest)) => {
+            let host = rest.find('/').unwrap_or(rest.len());
+            let begin = rest[..host].rfind('@').map_or(0, |at| at + 1);
+            format!("{scheme}://{}", &rest[begin..])
+        }
+        None => named.to_owned(),
+    }
+}
+
+/// The path of a `file://` URI, in which percent signs are decoded.
+fn file_of(given: &str) -> Result<PathBuf> {
+    let no_file = |given: &str| {
+        let problem = format!("{} names no file of this machine by its whole path", without_secrets(given));
+        Error::config(
+            "dataset",
+            problem,
+            "give a path, or file:///and/the/whole/path, with %23 and %3F for '#' and '?'",
+        )
+    };
+    match Url::parse(given) {
+        Ok(url) if url.query().is_none() && url.fragment().is_none() => url.to_file_path().map_err(|()| no_file(given)),
+        _ => Err(no_file(given)),
     }
 }
 
@@ -167,6 +209,40 @@ mod tests {
             assert!(error.contains("control character") && !error.contains(['\n', '\u{1b}']), "{error}");
         }
         assert!(Location::parse("runs/a\nb.lance").is_ok(), "the name of a file");
+    }
+
+    #[test]
+    fn rejects_what_is_no_part_of_a_name() {
+        for (given, problem) in [
+            ("s3://b/rooms.lance#small", "'?' or '#'"),
+            ("s3://b/sweep#1/rooms.lance", "%23"),
+            ("http://host/d.h5?X-Amz-Signature=SECRET", "'?' or '#'"),
+            ("https://me:SECRET@host/d.h5", "password"),
+            ("https://SECRET@host/d.h5", "user name"),
+            ("https://me:SECRET@host:port/d.h5", "not a valid URI"),
+            ("https://me:SECRET@ho st/d.h5", "not a valid URI"),
+            ("https://me:SECRET@host/d.h5\n", "control character"),
+            ("file:///x.h5?sig=SECRET", "file:///"),
+        ] {
+            let error = Location::parse(given).expect_err(given).to_string();
+            assert!(error.contains(problem) && !error.contains("SECRET"), "{error}");
+        }
+        assert!(Location::parse("s3://b/sweep%231/rooms.lance").is_ok());
+    }
+
+    #[test]
+    fn file_uris_are_paths() -> Result<()> {
+        for (given, path) in [
+            ("file:///tmp/my%20rooms.lance", "/tmp/my rooms.lance"),
+            ("file://localhost/tmp/a.h5", "/tmp/a.h5"),
+            ("file:///tmp/a.lance/", "/tmp/a.lance/"),
+        ] {
+            assert_eq!(Location::parse(given)?, Location::Path(path.into()), "{given}");
+        }
+        for given in ["file://host/tmp/a.h5", "file://runs/a.h5"] {
+            assert!(Location::parse(given).is_err_and(|error| error.to_string().contains("file:///")), "{given}");
+        }
+        Ok(())
     }
 
     #[test]

@@ -6,6 +6,8 @@
 //! store has its own Cargo feature.
 
 mod blocks;
+#[cfg(any(feature = "s3", feature = "gs", feature = "az"))]
+mod connector;
 #[cfg(feature = "tls")]
 mod patience;
 mod threads;
@@ -18,11 +20,12 @@ pub use whole::{list_files, list_names, list_versions, read_file, write_file, wr
 
 use crate::dataset::location::Location;
 use object_store::path::Path as StorePath;
-use object_store::{ObjectStore, ObjectStoreExt as _};
+use object_store::{GetOptions, ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::SystemTime;
 use swm_core::{Error, Result};
 use url::Url;
 
@@ -101,7 +104,8 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
         #[cfg(feature = "s3")]
         "s3" => {
             use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
-            let mut builder = AmazonS3Builder::from_env().with_url(url.as_str());
+            let mut builder =
+                AmazonS3Builder::from_env().with_url(url.as_str()).with_http_connector(connector::Connector);
             for (key, value) in patience::client_settings() {
                 builder = builder.with_config(AmazonS3ConfigKey::Client(key), value);
             }
@@ -110,7 +114,8 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
         #[cfg(feature = "gs")]
         "gs" => {
             use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
-            let mut builder = GoogleCloudStorageBuilder::from_env().with_url(url.as_str());
+            let mut builder =
+                GoogleCloudStorageBuilder::from_env().with_url(url.as_str()).with_http_connector(connector::Connector);
             for (key, value) in patience::client_settings() {
                 builder = builder.with_config(GoogleConfigKey::Client(key), value);
             }
@@ -119,7 +124,8 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
         #[cfg(feature = "az")]
         "az" => {
             use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
-            let mut builder = MicrosoftAzureBuilder::from_env().with_url(url.as_str());
+            let mut builder =
+                MicrosoftAzureBuilder::from_env().with_url(url.as_str()).with_http_connector(connector::Connector);
             for (key, value) in patience::client_settings() {
                 builder = builder.with_config(AzureConfigKey::Client(key), value);
             }
@@ -164,7 +170,15 @@ pub(crate) fn store_error(label: &Path, action: &str, error: &object_store::Erro
             format!("{action}: there is no such object"),
             "check the name; names in object stores are case-sensitive",
         ),
-        other => Error::external(format!("{}: {action}", label.display()), other),
+        other => {
+            let redirects = other.to_string().contains("non-2xx status code: 3");
+            let hint = if redirects {
+                " (it redirects to another host, which is not followed; set the store's address and region, such as AWS_ENDPOINT_URL and AWS_REGION)"
+            } else {
+                ""
+            };
+            Error::external(format!("{}: {action}{hint}", label.display()), other)
+        }
     }
 }
 
@@ -174,6 +188,34 @@ pub struct ObjectFile {
     path: StorePath,
     label: PathBuf,
     len: u64,
+    /// What changes when the object is replaced.
+    version: Version,
+}
+
+/// What changes when an object is replaced.
+#[derive(Clone, Debug)]
+struct Version {
+    size: u64,
+    tag: Option<String>,
+    /// The time of the last change; `None` if the server does not say it.
+    modified: Option<SystemTime>,
+}
+
+impl Version {
+    fn of(meta: &ObjectMeta) -> Self {
+        // A tag that is marked as weak names the same content.
+        let tag = meta.e_tag.as_ref().map(|tag| tag.strip_prefix("W/").unwrap_or(tag).to_owned());
+        let modified = Some(SystemTime::from(meta.last_modified)).filter(|time| *time != SystemTime::UNIX_EPOCH);
+        Self { size: meta.size, tag, modified }
+    }
+
+    /// Whether two answers of a server are of one object. Several servers behind an address may give other tags, or leave headers out.
+    fn is(&self, other: &Self) -> bool {
+        let same_tag = self.tag.as_ref().zip(other.tag.as_ref()).map(|(a, b)| a == b);
+        let same_time = self.modified.zip(other.modified).map(|(a, b)| a == b);
+        let told: Vec<bool> = same_tag.into_iter().chain(same_time).collect();
+        self.size == other.size && (told.is_empty() || told.contains(&true))
+    }
 }
 
 impl ObjectFile {
@@ -190,7 +232,7 @@ impl ObjectFile {
             "opening the file",
             block_on(async move { request_store.head(&request_path).await })?,
         )?;
-        Ok(Self { store, path, label, len: meta.size })
+        Ok(Self { store, path, label, len: meta.size, version: Version::of(&meta) })
     }
 
     /// Size in bytes.
@@ -216,8 +258,13 @@ impl ObjectFile {
         let (store, path) = (Arc::clone(&self.store), self.path.clone());
         let ranges = ranges.to_vec();
         let action = "reading it";
-        let result = block_on(async move { fetch(&*store, &path, &ranges).await })?;
-        Self::finish(&self.label, action, result)
+        let result = block_on(async move { fetch_with_versions(&*store, &path, &ranges).await })?;
+        let (parts, versions) = Self::finish(&self.label, action, result)?;
+        if !versions.iter().all(|version| version.is(&self.version)) {
+            let fix = "open the dataset again; keep its files as they are while they are read";
+            return Err(Error::corrupt(&self.label, "it was written over while it was read", fix));
+        }
+        Ok(parts)
     }
 
     fn finish<T>(label: &Path, action: &str, result: Option<object_store::Result<T>>) -> Result<T> {
@@ -234,14 +281,26 @@ pub(crate) async fn fetch(
     path: &StorePath,
     ranges: &[Range<u64>],
 ) -> object_store::Result<Vec<Bytes>> {
+    Ok(fetch_with_versions(store, path, ranges).await?.0)
+}
+
+/// Reads ranges of an object; also returns the versions that the store read them from.
+async fn fetch_with_versions(
+    store: &dyn ObjectStore,
+    path: &StorePath,
+    ranges: &[Range<u64>],
+) -> object_store::Result<(Vec<Bytes>, Vec<Version>)> {
     use futures::{StreamExt as _, TryStreamExt as _};
     let joined = merge_ranges(ranges);
-    let parts: Vec<Bytes> = futures::stream::iter(joined.clone())
-        .map(|range| store.get_range(path, range))
-        .buffered(REQUESTS)
-        .try_collect()
-        .await?;
-    ranges
+    let read = |range: Range<u64>| async move {
+        let options = GetOptions { range: Some(range.into()), ..GetOptions::default() };
+        let result = store.get_opts(path, options).await?;
+        let version = Version::of(&result.meta);
+        Ok::<_, object_store::Error>((result.bytes().await?, version))
+    };
+    let parts = futures::stream::iter(joined.clone()).map(read).buffered(REQUESTS).try_collect::<Vec<_>>().await?;
+    let (parts, versions): (Vec<Bytes>, Vec<Version>) = parts.into_iter().unzip();
+    let slices = ranges
         .iter()
         .map(|range| {
             if range.is_empty() {
@@ -259,7 +318,8 @@ pub(crate) async fn fetch(
             }
             Ok(parts[at].slice(start..end))
         })
-        .collect()
+        .collect::<object_store::Result<_>>()?;
+    Ok((slices, versions))
 }
 
 /// Merges ranges with small gaps into sorted, disjoint requests.
@@ -300,6 +360,33 @@ mod tests {
         }
         assert!(file.read(std::slice::from_ref(&(0..3_000_001))).is_err());
         Ok(())
+    }
+
+    #[test]
+    fn versions_are_compared_by_what_both_answers_tell() {
+        let version = |size, tag: Option<&str>, modified: Option<u64>| Version {
+            size,
+            tag: tag.map(str::to_owned),
+            modified: modified.map(|seconds| SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(seconds)),
+        };
+        let opened = version(9, Some("x"), Some(5));
+        for same in [
+            version(9, Some("x"), Some(5)),
+            version(9, None, None),
+            version(9, Some("x"), None),
+            version(9, Some("other server"), Some(5)),
+            version(9, Some("x"), Some(6)),
+        ] {
+            assert!(opened.is(&same), "{same:?}");
+        }
+        for other in [
+            version(8, Some("x"), Some(5)),
+            version(9, Some("y"), Some(6)),
+            version(9, Some("y"), None),
+            version(9, None, Some(6)),
+        ] {
+            assert!(!opened.is(&other), "{other:?}");
+        }
     }
 
     #[test]

@@ -241,7 +241,10 @@ impl Client {
                 None => return Ok(answer),
             }
         }
-        Err(Error::external(url, format!("more than {MAX_REDIRECTIONS} redirections; check the address of the hub")))
+        Err(Error::external(
+            named(&url),
+            format!("more than {MAX_REDIRECTIONS} redirections; check the address of the hub"),
+        ))
     }
 
     /// The address to which an answer sends a request. What is written stays at the hub's own host.
@@ -276,8 +279,8 @@ impl Client {
             None => format!("set {TOKEN} to a token of your account (the hub's settings make them)"),
             Some(_) => format!("check that the token in {TOKEN} may read it"),
         };
-        let named = uri.at("main").to_string();
-        let fail = |problem: &str, fix: String| Err(Error::config(named.clone(), problem, fix));
+        let repository = uri.at("main").to_string();
+        let fail = |problem: &str, fix: String| Err(Error::config(repository.clone(), problem, fix));
         match (code, status) {
             ("GatedRepo", _) => {
                 fail("is gated: its owner asks readers to accept terms", format!("accept them at {page}, then {login}"))
@@ -295,8 +298,9 @@ impl Client {
             }
             _ => {
                 let words = if message.is_empty() { String::new() } else { format!(": {message}") };
+                // The address of a storage may have a signature.
                 Err(Error::external(
-                    answer.url().as_str(),
+                    named(answer.url().as_str()),
                     format!("the hub answered {status}{words}; try again later"),
                 ))
             }

@@ -11,6 +11,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{Read as _, Write as _};
 use std::ops::Range;
 use std::path::Path;
+use std::time::{Duration, Instant};
 use swm_core::files::{self, Lock};
 use swm_core::run::{Control, Event, Progress, Stage};
 use swm_core::{Error, Result};
@@ -19,6 +20,8 @@ use swm_core::{Error, Result};
 const STAGE: &str = "pull";
 /// How often a download is tried, without those tries that bring [`PROGRESS`].
 const ATTEMPTS: usize = 4;
+/// The time between the first two tries; it grows with each further one.
+const PAUSE: Duration = Duration::from_millis(500);
 /// The bytes that a connection must bring before it breaks, to be no failed try.
 const PROGRESS: u64 = 1 << 20;
 /// The bytes that are read of a file at once.
@@ -132,6 +135,7 @@ impl Hub {
                     if let Err(error) = outcome {
                         control.emit(Event::Log(&format!("{error}; trying again")));
                     }
+                    pause(PAUSE * attempts as u32, control)?;
                 }
             }
         }
@@ -139,6 +143,17 @@ impl Hub {
         std::fs::rename(&part, &path).map_err(|error| Error::io(&path, "saving a download", error))?;
         Ok(transferred)
     }
+}
+
+/// Waits, and can be stopped.
+fn pause(time: Duration, control: &mut Control<'_>) -> Result<()> {
+    const STEP: Duration = Duration::from_millis(50);
+    let until = Instant::now() + time;
+    while Instant::now() < until {
+        control.check()?;
+        std::thread::sleep(STEP);
+    }
+    Ok(())
 }
 
 /// Appends what a file lacks, which are the bytes `missing`.

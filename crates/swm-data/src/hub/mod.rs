@@ -7,6 +7,7 @@
 
 mod cache;
 mod client;
+mod commit_line;
 mod download;
 mod pace;
 mod pointer;

@@ -1,6 +1,7 @@
 //! [`Hub::push`]: uploads files as one commit.
 
-use super::client::{Body, Client, Content, header, json_body, parsed, whole};
+use super::client::{Body, Client, Content, header, json_body, named, parsed, whole};
+use super::commit_line::Line;
 use super::download::sha256;
 use super::{Hub, HubUri, RepoKind};
 use base64::Engine as _;
@@ -14,6 +15,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 use swm_core::run::{Control, Event, Progress, Stage};
 use swm_core::text::one_line;
 use swm_core::{Error, Result};
@@ -62,20 +64,27 @@ pub struct Pushed {
     pub uploaded: u64,
 }
 
-/// A line of a commit. Files that are part of the commit are read while it is sent.
-struct Line {
-    json: String,
-    /// The file whose content belongs into `json`, and its size.
-    file: Option<(PathBuf, u64)>,
-}
-
 /// A file to upload.
 struct Upload {
     local: PathBuf,
     path: String,
     size: u64,
+    /// When it was last changed before it was hashed.
+    modified: Option<SystemTime>,
     sha256: String,
     sample: String,
+}
+
+impl Upload {
+    /// Checks that the file is the one that was hashed.
+    fn check_unchanged(&self) -> Result<()> {
+        let found = std::fs::metadata(&self.local).map_err(|error| reading(&self.local, error))?;
+        if found.len() == self.size && found.modified().ok() == self.modified {
+            return Ok(());
+        }
+        let fix = "wait until the program that writes it has ended, then run it again";
+        Err(Error::config(self.local.display().to_string(), "changed while it was uploaded", fix))
+    }
 }
 
 /// Where the parts of a large file are sent.
@@ -250,7 +259,7 @@ impl Client {
         let addresses: BTreeMap<u64, String> = action.header.iter().filter_map(numbered).collect();
         if addresses.len() as u64 != upload.size.div_ceil(size) {
             let problem = format!("it asks for {} parts of {size} bytes of {}", addresses.len(), upload.size);
-            return Err(Error::corrupt(&action.href, problem, "check the address of the hub"));
+            return Err(Error::corrupt(named(&action.href), problem, "check the address of the hub"));
         }
         let mut parts = vec![];
         for (index, address) in addresses.values().enumerate() {
@@ -273,7 +282,10 @@ impl Client {
         let length = last.saturating_sub(first);
         let content = Content::Blocks(length, Box::new(blocks(file.take(length))));
         let body = Body { content, content_type: "application/octet-stream" };
-        let answer = self.send(Method::PUT, address, body, headers, false)?;
+        let answer = self.send(Method::PUT, address, body, headers, false);
+        // A file that has become shorter ends the request early, which looks like a broken connection.
+        upload.check_unchanged()?;
+        let answer = answer?;
         accepted(&answer, upload)?;
         let tag = answer.headers().get("etag").and_then(|tag| tag.to_str().ok()).unwrap_or_default();
         Ok(tag.to_owned())
@@ -311,30 +323,6 @@ impl Client {
     }
 }
 
-impl Line {
-    /// The empty text in `"content":""` stands for the content of the file.
-    fn new(json: &Value, file: Option<(PathBuf, u64)>) -> Self {
-        Self { json: format!("{json}\n"), file }
-    }
-
-    /// The number of bytes.
-    fn length(&self) -> u64 {
-        self.json.len() as u64 + self.file.as_ref().map_or(0, |(_, size)| size.div_ceil(3) * 4)
-    }
-
-    /// The line as it is sent.
-    fn bytes(&self) -> std::io::Result<Vec<u8>> {
-        const CONTENT: &str = "\"content\":\"";
-        let Some((path, size)) = &self.file else { return Ok(self.json.clone().into_bytes()) };
-        let mut content = vec![];
-        File::open(path)?.take(size + 1).read_to_end(&mut content)?;
-        let changed = || std::io::Error::other(format!("{} changed while it was uploaded", path.display()));
-        let (before, after) =
-            self.json.split_once(CONTENT).filter(|_| content.len() as u64 == *size).ok_or_else(changed)?;
-        Ok([before, CONTENT, &STANDARD.encode(content), after].concat().into_bytes())
-    }
-}
-
 /// The content of a file in blocks.
 fn blocks(mut file: std::io::Take<File>) -> impl Iterator<Item = std::io::Result<Bytes>> {
     std::iter::from_fn(move || {
@@ -369,11 +357,12 @@ fn uploads(from: &Path, to: &str, control: &mut Control<'_>) -> Result<Vec<Uploa
     let upload = |(path, local): (String, PathBuf)| {
         control.check()?;
         super::check_no_pointer(&local)?;
+        let modified = std::fs::metadata(&local).and_then(|found| found.modified()).ok();
         let (sha256, size) = sha256(&local, control)?;
         let mut sample = vec![];
         let file = File::open(&local).map_err(|error| reading(&local, error))?;
         file.take(SAMPLE as u64).read_to_end(&mut sample).map_err(|error| reading(&local, error))?;
-        Ok(Upload { local, path, size, sha256, sample: STANDARD.encode(sample) })
+        Ok(Upload { local, path, size, modified, sha256, sample: STANDARD.encode(sample) })
     };
     found.into_iter().map(upload).collect()
 }
@@ -428,19 +417,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_of_a_commit_have_the_content_of_their_files() {
+    fn files_that_change_after_they_were_hashed_are_noticed() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a");
-        for size in [0, 1, 2, 3, 1000] {
-            std::fs::write(&path, vec![7; size]).expect("a file");
-            let value = |content: &str| json!({"key": "file", "value": {"path": "\"content\":\"", "content": content}});
-            let line = Line::new(&value(""), Some((path.clone(), size as u64)));
-            let made = line.bytes().expect("a line");
-            assert_eq!(made, format!("{}\n", value(&STANDARD.encode(vec![7; size]))).into_bytes());
-            assert_eq!(made.len() as u64, line.length());
-            std::fs::write(&path, vec![7; size + 1]).expect("a file");
-            assert!(line.bytes().is_err(), "the file changed");
-        }
+        std::fs::write(&path, [7; 9]).expect("a file");
+        let uploads = uploads(&path, "", &mut Control::new()).expect("a file to upload");
+        uploads[0].check_unchanged().expect("the same file");
+        let later = SystemTime::now() + std::time::Duration::from_secs(2);
+        std::fs::write(&path, [8; 9]).expect("other content");
+        File::options().append(true).open(&path).and_then(|file| file.set_modified(later)).expect("a later time");
+        let error = uploads[0].check_unchanged().expect_err("another file").to_string();
+        assert!(error.contains("changed while it was uploaded"), "{error}");
     }
 
     #[test]

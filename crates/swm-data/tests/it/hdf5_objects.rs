@@ -37,6 +37,52 @@ fn reads_files_in_a_bucket_and_on_a_web_server() {
 }
 
 #[test]
+fn objects_that_are_written_over_while_they_are_open_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
+    let path = folder.path().join("bucket/d.h5");
+    format_suite::write(&path, WriteMode::Create, 0..30);
+    let web = objects::serve(folder.path(), false);
+    let reader = open(Location::parse(&format!("{web}/bucket/d.h5")).expect("a location")).expect("the dataset");
+    let ranges = [StepRange::new(0, 0, 2)];
+    reader.read(&["state"], &ranges).expect("reading rows");
+    // Another content of the same size, at a later time.
+    let mut content = std::fs::read(&path).expect("the file");
+    let middle = content.len() / 2;
+    content[middle] ^= 1;
+    std::thread::sleep(std::time::Duration::from_millis(1100));
+    std::fs::write(&path, content).expect("writing it over");
+    let error = reader.read(&["pixels", "action"], &ranges).expect_err("another file").to_string();
+    assert!(error.contains("written over while it was read"), "{error}");
+    open(Location::parse(&format!("{web}/bucket/d.h5")).expect("a location")).expect("opening it again");
+}
+
+#[test]
+fn signatures_and_tokens_do_not_follow_redirections_to_another_host() {
+    use std::io::{Read as _, Write as _};
+    let listen = || std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let (store, other) = (listen(), listen());
+    let elsewhere = other.local_addr().expect("an address");
+    let bucket = format!("http://{}", store.local_addr().expect("an address"));
+    std::thread::spawn(move || {
+        for mut stream in store.incoming().flatten() {
+            let mut request = [0; 4096];
+            let _ = stream.read(&mut request);
+            let head = "HTTP/1.1 307 Temporary Redirect\r\nContent-Length: 0\r\nConnection: close";
+            let _ = write!(stream, "{head}\r\nLocation: http://{elsewhere}/d.h5\r\n\r\n");
+        }
+    });
+    let output = objects::child("child_that_reads", &bucket, "s3://bucket/d.h5")
+        .env("AWS_SESSION_TOKEN", "a-secret")
+        .output()
+        .expect("running the child process");
+    let text = objects::finished(&output);
+    assert!(text.contains("failed: "), "{text}");
+    other.set_nonblocking(true).expect("a listener");
+    assert!(other.accept().is_err(), "a request arrived at the other host");
+}
+
+#[test]
 fn does_not_write_to_a_web_server() {
     let location = Location::parse("http://127.0.0.1:9/d.h5").expect("parsing the location");
     let error = format_suite::writer(&location, WriteMode::Create).err().expect("the call must fail").to_string();

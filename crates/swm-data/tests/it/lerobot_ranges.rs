@@ -2,9 +2,9 @@
 
 use crate::fuzz;
 use crate::hostile::copied;
-use crate::lerobot::{EPISODES, change_values, rewrite};
+use crate::lerobot::{DATA, EPISODES, change_values, rewrite};
 use arrow_array::RecordBatch;
-use arrow_array::types::{Float64Type, Int64Type};
+use arrow_array::types::{Float32Type, Float64Type, Int64Type};
 use std::path::Path;
 use swm_core::run::Control;
 use swm_data::doctor::{Severity, examine};
@@ -113,6 +113,33 @@ fn rounded_times_and_lists_without_ranges_are_read() {
         batch
     });
     assert_eq!(fuzz::read_everything(&path).expect("no ranges"), expected);
+}
+
+#[test]
+fn timestamps_outside_of_an_episode_are_refused_and_reported() {
+    // The first episode, of ten frames per second, seems to begin three frames late, in the middle of its part of the video.
+    for (rows, late, step, has_ends) in [(0..11, 0.3, 8, true), (0..11, 0.3, 8, false), (11..25, -0.2, 0, true)] {
+        let (_folder, path) = copied(NAME);
+        if !has_ends {
+            rewrite(&path.join(EPISODES), |batch| {
+                let schema = batch.schema();
+                let is_end = |name: &str| name.ends_with("/to_timestamp");
+                let left: Vec<usize> =
+                    (0..batch.num_columns()).filter(|&at| !is_end(schema.field(at).name())).collect();
+                batch.project(&left).expect("fewer columns")
+            });
+        }
+        change_values::<Float32Type>(&path.join(DATA), "timestamp", |times| {
+            times[rows.clone()].iter_mut().flatten().for_each(|time| *time += late);
+        });
+        let episode = usize::from(rows.start > 0);
+        let expected = format!("step {step} of episode {episode} has the timestamp");
+        let error = fuzz::read_everything(&path).expect_err("frames of another episode").to_string();
+        assert!(error.contains(&expected), "{error}");
+        let reader = open(&path).expect("opening reads no timestamps");
+        let diagnosis = examine(&*reader, &[], &mut Control::new()).expect("an examination");
+        assert!(diagnosis.findings.iter().any(|found| found.what.contains(&expected)), "{:?}", diagnosis.findings);
+    }
 }
 
 #[test]

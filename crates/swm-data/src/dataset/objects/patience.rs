@@ -21,11 +21,11 @@ const QUIET: Duration = Duration::from_secs(3);
 /// The time between two messages.
 const BETWEEN_MESSAGES: Duration = Duration::from_secs(10);
 /// The time to connect.
-const CONNECT: Duration = Duration::from_secs(5);
+pub(super) const CONNECT: Duration = Duration::from_secs(5);
 /// The time without a byte of an answer; a request's body is sent within it.
-const READ: Duration = Duration::from_secs(20);
+pub(super) const READ: Duration = Duration::from_secs(20);
 /// The time of a whole request.
-const TOTAL: Duration = Duration::from_secs(300);
+pub(super) const TOTAL: Duration = Duration::from_secs(300);
 /// The time after which a failed request is not repeated.
 const RETRY: Duration = Duration::from_secs(30);
 

@@ -70,6 +70,22 @@ impl LerobotReader {
         found.collect()
     }
 
+    /// Finds the episodes with rows whose timestamps are outside of the episode's part of a video.
+    pub fn misplaced_times(&self) -> Result<Vec<Irregularity>> {
+        if self.info.video_keys().is_empty() {
+            return Ok(vec![]);
+        }
+        let times = self.timestamps()?;
+        let episodes = self.files_of_episodes.iter().enumerate();
+        let found = episodes.filter_map(|(episode, files)| {
+            let (step, time) = (0..files.length)
+                .map(|step| (step, self.time(times, episode, step)))
+                .find(|&(_, time)| files.videos.iter().any(|part| part.at(time, self.fps).is_none()))?;
+            Some(Irregularity { episode: Some(episode), what: outside(episode, step, time) })
+        });
+        Ok(found.collect())
+    }
+
     /// Finds the episodes whose rows do not count up from 0 in their file. Readers take rows in the order of the file.
     pub fn misplaced_rows(&self) -> Result<Vec<Irregularity>> {
         if !self.info.features.0.iter().any(|(name, _)| name == FRAME_INDEX) {
@@ -86,6 +102,13 @@ impl LerobotReader {
         });
         Ok(found.collect())
     }
+}
+
+/// What is wrong with a row whose frame is another episode's.
+pub(super) fn outside(episode: usize, step: usize, time: f64) -> String {
+    format!(
+        "step {step} of episode {episode} has the timestamp {time:.3} s, which is outside of the episode's part of a video"
+    )
 }
 
 /// The error of a file that has other rows.

@@ -154,7 +154,10 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
             let part = |(key, columns): (&&str, &VideoColumns)| {
                 let indices = indices(columns.chunk[row], columns.file[row]);
                 let path = video_file(root, info, key, &indices)?;
-                Ok(VideoPart { path, begin: columns.begin[row], end: columns.end[row] })
+                let begin = columns.begin[row];
+                // The next episode of the video begins where the rows end.
+                let end = columns.end[row].or_else(|| Some(begin + length[row] as f64 / info.fps()?));
+                Ok(VideoPart { path, begin, end })
             };
             let videos: Result<Vec<VideoPart>> = keys.iter().zip(&videos).map(part).collect();
             let files = EpisodeFiles {

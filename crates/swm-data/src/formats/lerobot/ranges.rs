@@ -102,6 +102,14 @@ impl Ranges {
 }
 
 impl VideoPart {
+    /// The time in the video of a row that is `time` seconds after the start of its episode; `None` if the frame there is another
+    /// episode's.
+    pub fn at(&self, time: f64, fps: f64) -> Option<f64> {
+        let (at, tolerance) = (self.begin + time, TOLERANCE / fps);
+        let is_inside = at >= self.begin - tolerance && self.end.is_none_or(|end| at <= end - tolerance);
+        is_inside.then_some(at)
+    }
+
     /// What is wrong with a part that is longer than the rows of its episode; `None` if it is not.
     pub fn excess(&self, camera: &str, length: usize, fps: f64) -> Option<String> {
         let (end, rows) = (self.end?, length as f64 / fps);

@@ -1,10 +1,9 @@
 //! Reads numeric columns from Parquet files, and frames from videos by time. Numeric columns are cached in memory after
 //! the first access.
 
-use super::checks::other_rows;
+use super::checks::{other_rows, outside};
 use super::episode_files::EpisodeFiles;
 use super::info::{Column, Info, Kind, damaged};
-use super::ranges::VideoPart;
 use super::{TASK, table, values};
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
@@ -184,7 +183,7 @@ impl LerobotReader {
     }
 
     /// The timestamp of each row, in seconds from the start of the row's episode.
-    fn timestamps(&self) -> Result<Option<&[f32]>> {
+    pub(super) fn timestamps(&self) -> Result<Option<&[f32]>> {
         if let Some(known) = self.timestamps.get() {
             return Ok(known.as_deref());
         }
@@ -203,8 +202,8 @@ impl LerobotReader {
         let slots = self.rows.row_slots(column, ranges, out)?;
         let mut frames = Vec::with_capacity(slots.len());
         for ((episode, step), slot) in slots {
-            let VideoPart { path, begin, .. } = &self.files_of_episodes[episode].videos[feature];
-            frames.push((path.clone(), begin + self.time(times, episode, step), slot));
+            let path = &self.files_of_episodes[episode].videos[feature].path;
+            frames.push((path.clone(), self.time_in_video(times, feature, episode, step)?, slot));
         }
         let source = |path: &PathBuf| Ok(Source::File(path.clone()));
         let read = self.videos.read(frames, source, |video, &time| self.frame(video, time));
@@ -215,9 +214,16 @@ impl LerobotReader {
     }
 
     /// Time from the start of the episode to a row, in seconds.
-    fn time(&self, times: Option<&[f32]>, episode: usize, step: usize) -> f64 {
+    pub(super) fn time(&self, times: Option<&[f32]>, episode: usize, step: usize) -> f64 {
         let row = self.rows.first_rows()[episode] as usize + step;
         times.and_then(|times| times.get(row)).map_or(step as f64 / self.fps, |&time| f64::from(time))
+    }
+
+    /// Time from the start of a row's video to its frame, in seconds.
+    fn time_in_video(&self, times: Option<&[f32]>, feature: usize, episode: usize, step: usize) -> Result<f64> {
+        let time = self.time(times, episode, step);
+        let at = self.files_of_episodes[episode].videos[feature].at(time, self.fps);
+        at.ok_or_else(|| damaged(&self.root, outside(episode, step, time)))
     }
 
     /// Index of the frame at a time in seconds.
@@ -386,6 +392,7 @@ impl Reader for LerobotReader {
 
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         let mut found = self.excess_of_videos();
+        found.extend(self.misplaced_times()?);
         found.extend(self.misplaced_rows()?);
         Ok(found)
     }
@@ -451,10 +458,10 @@ impl Reader for LerobotReader {
                         })?;
                     }
                     Kind::Video(feature) => {
-                        let VideoPart { path, begin, .. } = &self.files_of_episodes[position].videos[feature];
+                        let path = &self.files_of_episodes[position].videos[feature].path;
                         let video = self.videos.get(path, || Ok(Source::File(path.clone())))?;
                         let frames: Result<Vec<usize>> = (0..episode.length)
-                            .map(|step| self.frame(&video, begin + self.time(times, position, step)))
+                            .map(|step| self.frame(&video, self.time_in_video(times, feature, position, step)?))
                             .collect();
                         video.coded(frames?, &mut *add)?;
                     }

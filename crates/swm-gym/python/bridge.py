@@ -545,8 +545,9 @@ class Bridge:
             raise ValueError(f'unknown request {op}')
 
     def reset(self, seed, native_seed=None, variation=None, variation_values=None, recorded=None):
-        """Starts an episode. A native environment takes `native_seed` in place of `seed`, which wrappers get. `variation` and `variation_values` become the `options` of the environment's reset; `recorded`
-        are the arguments of `set_recorded_state`."""
+        """Starts an episode. A native environment takes `native_seed` in place of `seed`, which wrappers get. `variation` and
+        `variation_values` become the `options` of the environment's reset; `recorded` are the arguments of
+        `set_recorded_state`."""
         options = {}
         if variation is not None:
             options['variation'] = variation

@@ -113,16 +113,15 @@ impl Location {
     }
 }
 
-/// A URI for an error: without a user name, a password, a query and a fragment, which can be secrets.
+/// A URI for an error: without a user name, a password, a query and a fragment, which can be secrets. A password may have any of the
+/// characters that end the other parts, so that nothing is shown before the last `@`.
 fn without_secrets(given: &str) -> String {
-    let named = given.split(['?', '#']).next().unwrap_or_default();
-    match named.split_once("://") {
-        Some((scheme, rest)) => {
-            let host = rest.find('/').unwrap_or(rest.len());
-            let begin = rest[..host].rfind('@').map_or(0, |at| at + 1);
-            format!("{scheme}://{}", &rest[begin..])
-        }
-        None => named.to_owned(),
+    let (scheme, rest) = given.split_once("://").unwrap_or(("", given));
+    let named = rest.split(['?', '#']).next().unwrap_or_default();
+    match rest.rfind('@') {
+        Some(at) if at >= named.len() => format!("{scheme}://…"),
+        Some(at) => format!("{scheme}://…{}", &named[at..]),
+        None => format!("{scheme}://{named}"),
     }
 }
 
@@ -221,6 +220,8 @@ mod tests {
             ("https://SECRET@host/d.h5", "user name"),
             ("https://me:SECRET@host:port/d.h5", "not a valid URI"),
             ("https://me:SECRET@ho st/d.h5", "not a valid URI"),
+            ("https://me:SECRET/SECRET@host/d.h5", "not a valid URI"),
+            ("https://me:SECRET#SECRET@host/d.h5", "not a valid URI"),
             ("https://me:SECRET@host/d.h5\n", "control character"),
             ("file:///x.h5?sig=SECRET", "file:///"),
         ] {

@@ -1,14 +1,21 @@
 //! HDF5 files in object stores, read by byte ranges.
 
 use crate::{format_suite, objects};
+use std::path::PathBuf;
 use swm_data::{Location, StepRange, WriteMode, open};
 
-#[test]
-fn reads_files_in_a_bucket_and_on_a_web_server() {
+/// A folder with a bucket that has a dataset, and the path of the dataset.
+fn bucket() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
     let path = folder.path().join("bucket/d.h5");
     format_suite::write(&path, WriteMode::Create, 0..30);
+    (folder, path)
+}
+
+#[test]
+fn reads_files_in_a_bucket_and_on_a_web_server() {
+    let (folder, path) = bucket();
 
     let web = objects::serve(folder.path(), false);
     let location = Location::parse(&format!("{web}/bucket/d.h5")).expect("parsing the location");
@@ -38,10 +45,7 @@ fn reads_files_in_a_bucket_and_on_a_web_server() {
 
 #[test]
 fn objects_that_are_written_over_while_they_are_open_are_refused() {
-    let folder = tempfile::tempdir().expect("creating a temporary folder");
-    std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
-    let path = folder.path().join("bucket/d.h5");
-    format_suite::write(&path, WriteMode::Create, 0..30);
+    let (folder, path) = bucket();
     let web = objects::serve(folder.path(), false);
     let reader = open(Location::parse(&format!("{web}/bucket/d.h5")).expect("a location")).expect("the dataset");
     let ranges = [StepRange::new(0, 0, 2)];

@@ -57,12 +57,12 @@ fn seconds(text: &str) -> Option<Duration> {
         match unit {
             "ms" => Some(Duration::from_millis(count)),
             "s" => Some(Duration::from_secs(count)),
-            "m" => Some(Duration::from_secs(60 * count)),
-            "h" => Some(Duration::from_secs(3600 * count)),
+            "m" => Some(Duration::from_secs(count.saturating_mul(60))),
+            "h" => Some(Duration::from_secs(count.saturating_mul(3600))),
             _ => None,
         }
     };
-    text.split_whitespace().map(part).sum()
+    text.split_whitespace().try_fold(Duration::ZERO, |sum, text| Some(sum.saturating_add(part(text)?)))
 }
 
 fn invalid(error: reqwest::Error) -> object_store::Error {

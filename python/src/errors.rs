@@ -2,6 +2,7 @@
 
 use crate::exit::{self, is_over};
 use crate::held::Held;
+use crate::warnings;
 use pyo3::exceptions::{PyFileNotFoundError, PyKeyboardInterrupt, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -46,7 +47,7 @@ pub fn attached<T>(work: impl FnOnce(Python<'_>) -> PyResult<T>) -> swm::core::R
 }
 
 /// Creates a poll function for long loops. The function runs Python's signal handlers at most every 20 ms, so that
-/// Ctrl-C raises `KeyboardInterrupt`.
+/// Ctrl-C raises `KeyboardInterrupt`, and issues the warnings of the engine.
 pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
     let mut last = Instant::now();
     move || {
@@ -57,7 +58,10 @@ pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
             return Ok(());
         }
         last = Instant::now();
-        attached(|py| py.check_signals())
+        attached(|py| {
+            warnings::issue(py)?;
+            py.check_signals()
+        })
     }
 }
 

@@ -3,6 +3,7 @@
 //! threads, and a thread that Python unwinds out of a user's code stops at [`call`].
 
 use crate::errors::from_py_err;
+use crate::warnings;
 use pyo3::exceptions::PySystemExit;
 use pyo3::ffi::PyObject;
 use pyo3::prelude::*;
@@ -58,16 +59,17 @@ pub fn end_of_thread() -> Error {
     from_py_err(PySystemExit::new_err(()))
 }
 
-/// Runs `work` without the GIL.
+/// Runs `work` without the GIL, then issues the warnings of the engine.
 ///
 /// # Errors
-/// The error of `work`; `SystemExit`, which ends a thread silently, if the interpreter ends meanwhile.
+/// The error of `work`; a warning that Python turns into an error; `SystemExit`, which ends a thread silently, if the interpreter ends meanwhile.
 pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
     let call = Call::begin();
     let outcome = if is_over() { None } else { Some(py.detach(work)) };
+    let warned = if is_over() { Ok(()) } else { warnings::issue(py) };
     drop(call);
     match outcome {
-        Some(outcome) if !is_over() => outcome,
+        Some(outcome) if !is_over() => outcome.and_then(|value| warned.map(|()| value).map_err(from_py_err)),
         _ => Err(end_of_thread()),
     }
 }
@@ -88,11 +90,13 @@ pub fn end_calls(py: Python<'_>) {
             thread::sleep(Duration::from_millis(1));
         }
     });
+    warnings::issue_or_print(py);
 }
 
-/// Forgets the calls of other threads, which a forked process does not have. Python calls this function after a fork.
+/// Forgets the calls of other threads, which a forked process does not have, and the warnings of the process before. Python calls this function after a fork.
 #[pyfunction]
 pub fn forget_calls() {
+    drop(warnings::take());
     CALLS.store(CALLS_HERE.get(), Ordering::SeqCst);
 }
 

@@ -1,7 +1,7 @@
 //! The Python extension module `stable_worldmodel._engine`: thin bindings, one concept per file. Users call the Python
 //! package `stable_worldmodel`; this module is private to it.
 //!
-//! - [`errors`]: engine errors as Python exceptions, and signal handling.
+//! - [`errors`]: engine errors as Python exceptions, and signal handling; [`warnings`]: the engine's warnings.
 //! - [`exit`]: the end of the interpreter.
 //! - [`arrays`]: batches as numpy arrays, and back.
 //! - [`world`], [`policy`]: batches of environments and the policies that act in them.
@@ -32,6 +32,7 @@ mod snapshots;
 mod solver;
 mod study;
 mod training;
+mod warnings;
 mod world;
 
 use pyo3::prelude::*;
@@ -88,6 +89,7 @@ mod _engine {
             exit::begin_end();
         }
         data::process::record_process();
+        warnings::collect();
         let finder = module.py().import("stable_worldmodel._zoo")?;
         if let Some(folder) = finder.getattr("data_wheel")?.call0()?.extract::<Option<PathBuf>>()? {
             swm::zoo::set_data_wheel(folder);

@@ -2,6 +2,7 @@
 
 use crate::errors::to_py_err;
 use crate::exit;
+use crate::warnings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 
@@ -53,5 +54,5 @@ pub fn home() -> PyResult<String> {
 /// Runs the command line with these arguments (the program's name first) and returns its exit code.
 #[pyfunction]
 pub fn command(py: Python<'_>, arguments: Vec<String>) -> u8 {
-    py.detach(|| swm::cli::run(arguments))
+    py.detach(|| warnings::printing(|| swm::cli::run(arguments)))
 }

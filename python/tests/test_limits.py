@@ -1,5 +1,7 @@
 """Tests of absurd counts, and of NaN and infinite values of environments."""
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
@@ -77,3 +79,23 @@ def test_values_that_are_not_finite_are_counted_or_refused(tmp_path):
         assert world.collect(path, episodes=2, seed=0, progress=False)["added"] == 2
     with pytest.raises(ValueError, match="column 'reward' of episode 0 is not finite"):
         world.collect(tmp_path / "strict.lance", episodes=2, seed=0, progress=False, strict_finite=True)
+
+
+def test_warnings_of_the_engine_are_warnings_of_python(capfd):
+    # A command of the program prints its own.
+    swm.cli.envs()
+
+    def two_steps():
+        world = swm.World("Faulty-v0", add_pixels=False)
+        world.set_policy(swm.policy.RandomPolicy())
+        world.reset(seed=0)
+        world.step()
+        world.step()
+
+    with pytest.warns(UserWarning, match=r"^Faulty-v0: 'reward' has NaN or infinite values"):
+        two_steps()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*has NaN")
+        with pytest.raises(UserWarning, match="'reward' has NaN"):
+            two_steps()
+    assert "NaN" not in capfd.readouterr().err

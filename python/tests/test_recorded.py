@@ -224,6 +224,8 @@ def test_native_environments_restore_recorded_states_without_callables(tmp_path)
     assert np.array_equal(world.evaluate(**picks, callables=CALLABLES)["steps"], plain["steps"])
     with pytest.warns(UserWarning, match="set_colour.*not called"):
         world.evaluate(**picks, callables=[{"method": "set_colour"}])
+    with pytest.warns(UserWarning, match="callables: without a dataset"):
+        world.evaluate(episodes=1, eval_budget=1, floor=False, progress=False, callables=CALLABLES)
 
     class Same(gymnasium.Wrapper):
         """A wrapper without effect, which makes a native environment run in this interpreter."""
@@ -250,7 +252,8 @@ class Timed(gymnasium.Env):
         return self.at, self.info()
 
     def info(self):
-        return {"state": np.append(self.at, self.time), "goal_state": self.goal, "goal_radius": 0.5, "goal_at": self.goal}
+        goals = {"goal": self.goal, "goal_state": self.goal, "goal_radius": 0.5, "goal_at": self.goal}
+        return {"state": np.append(self.at, self.time), **goals}
 
     def step(self, action):
         self.at, self.time = self.at + action, self.time + 1
@@ -275,7 +278,7 @@ def test_goals_that_the_goal_row_does_not_tell_are_asked_for_or_nan(tmp_path, ki
 
     class Seeing(swm.policy.BasePolicy):
         def get_action(self, infos, **named):
-            seen.append((infos["goal_state"][0, 0].copy(), infos["goal_radius"][0, 0]))
+            seen.append((infos["goal_state"][0, 0].copy(), infos["goal_radius"][0, 0], infos["info_goal"][0, 0].copy()))
             return np.zeros((1, 2), np.float32)
 
     try:
@@ -288,12 +291,70 @@ def test_goals_that_the_goal_row_does_not_tell_are_asked_for_or_nan(tmp_path, ki
                 world.evaluate(policy=Seeing(), dataset=tmp_path / "t.h5", **picks, seed=2, progress=False, floor=False)
     finally:
         gymnasium.registry.pop("Timed-v0")
-    warned = [str(warning.message) for warning in caught if "NaN" in str(warning.message)]
+    warned = [str(warning.message) for warning in caught if "until the first step" in str(warning.message)]
+    assert not any(str(warning.message).startswith("Timed-v0: ") for warning in caught)
     assert seen[0][1] == 0.5 and np.array_equal(seen[1][0], goal)
     if kind is Telling:
-        assert not warned and np.array_equal(seen[0][0], goal)
+        assert not warned and np.array_equal(seen[0][0], goal) and np.array_equal(seen[0][2], goal)
     else:
-        assert len(warned) == 1 and "'goal_state'" in warned[0] and np.isnan(seen[0][0]).all()
+        assert sorted(text.split()[0] for text in warned) == ["'goal_state'", "'info_goal'"]
+        assert np.isnan(seen[0][0]).all() and np.isnan(seen[0][2]).all()
+
+
+class Reaching(gymnasium.Env):
+    """A goal environment as those of Gymnasium-Robotics."""
+
+    action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    observation_space = gymnasium.spaces.Dict(
+        {key: gymnasium.spaces.Box(-99, 99, (2,), np.float64) for key in ("observation", "achieved_goal", "desired_goal")}
+    )
+
+    def __init__(self, render_mode=None):
+        pass
+
+    def observed(self):
+        return {"observation": self.at, "achieved_goal": self.at, "desired_goal": self.goal}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        (self.at, self.goal), self.steps = self.np_random.uniform(-3, 3, (2, 2)), -9
+        # Of the state that the reset draws, not of a recorded one.
+        return self.observed(), {"success": False}
+
+    def step(self, action):
+        self.at, self.steps = self.at + action, self.steps + 1
+        return self.observed(), 0.0, self.steps == 3, False, {}
+
+    def set_state(self, observation):
+        self.at, self.steps = np.array(observation), 0
+
+    def set_goal(self, goal):
+        self.goal = np.array(goal)
+
+
+def test_desired_goal_is_what_the_goal_row_achieved_from_the_first_step_on(tmp_path):
+    gymnasium.register("Reaching-v0", entry_point=Reaching, max_episode_steps=9)
+    seen = []
+
+    class Seeing(swm.policy.BasePolicy):
+        def get_action(self, infos, **named):
+            seen.append(infos["desired_goal"][0, 0].copy())
+            return np.zeros((1, 2), np.float32)
+
+    calls = [
+        {"method": "set_state", "args": {"observation": {"value": "observation"}}},
+        {"method": "set_goal", "args": {"goal": {"value": "goal_achieved_goal"}}},
+    ]
+    try:
+        with swm.World("Reaching-v0", num_envs=1, add_pixels=False) as world:
+            world.collect(tmp_path / "t.h5", policy=swm.policy.RandomPolicy(), episodes=1, seed=3, progress=False)
+            goal = swm.data.load_dataset(tmp_path / "t.h5", backend="numpy").load_episode(0)["achieved_goal"][4]
+            picks = {"episodes_idx": [0], "start_steps": [1], "goal_offset": 3, "eval_budget": 3, "callables": calls}
+            found = world.evaluate(policy=Seeing(), dataset=tmp_path / "t.h5", **picks, seed=2, progress=False, floor=False)
+    finally:
+        gymnasium.registry.pop("Reaching-v0")
+    assert len(seen) == 3 and all(np.array_equal(one, goal) for one in seen)
+    assert found["success_rate"] == 100.0
 
 
 class Still(swm.policy.BasePolicy):

@@ -359,6 +359,30 @@ def test_compressed_weights_and_long_configurations_are_refused(home):
         load_pretrained(folder / "stored.pt")
 
 
+def test_changed_bytes_of_weights_are_noticed(home, tmp_path):
+    network = torch.nn.Linear(16, 8)
+    torch.save(network.state_dict(), tmp_path / "weights.pt")
+    stored = (tmp_path / "weights.pt").read_bytes()
+    at = stored.index(network.weight.detach().numpy().tobytes())
+    changed = bytearray(stored)
+    changed[at + 7] ^= 8
+    settings = {"_target_": "torch.nn.Linear", "in_features": 16, "out_features": 8}
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    assert torch.equal(load_pretrained(tmp_path).weight, network.weight)
+    (tmp_path / "weights.pt").write_bytes(changed)
+    with pytest.raises(RuntimeError, match="is damaged, its checksum differs"):
+        load_pretrained(tmp_path)
+    with zipfile.ZipFile(tmp_path / "twice.pt", "w") as twice, zipfile.ZipFile(GOLDEN / "reference/lewm/weights.pt") as one:
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            for name in [*one.namelist(), one.namelist()[-1]]:
+                twice.writestr(name, one.read(name))
+    with pytest.raises(RuntimeError, match="is in it twice"):
+        _weights.read_state_dict(tmp_path / "twice.pt")
+    probes.attach_probe(network, "one", torch.nn.Linear(16, 8))
+    with pytest.raises(RuntimeError, match="is damaged, its checksum differs"):
+        probes.load_probe(network, "one", tmp_path / "weights.pt")
+
+
 def test_pickled_code_of_weights_does_not_run(home, tmp_path):
     class Evil:
         def __reduce__(self):

@@ -531,6 +531,7 @@ def test_indices_of_no_environment_are_refused(index):
         (lambda: rooms().collect(writer=[], episodes=1, policy=Zero(), codec="png"), ValueError, "codec: the writer decides"),
         (lambda: swm.policy.RandomPolicy(sed=3), TypeError, "unknown argument 'sed'; did you mean 'seed'"),
         (lambda: rooms().evaluate(policy=Zero(), protocol="loose"), ValueError, "compat"),
+        (lambda: rooms().evaluate(policy=Zero(), protocol="compat", hold=3), ValueError, "hold: 3"),
         (lambda: rooms().evaluate(policy=swm.policy.ExpertPolicy("weakk")), ValueError, "weak"),
         (lambda: rooms().evaluate(policy=Zero(), dataset="nothing"), FileNotFoundError, "nothing"),
         (lambda: rooms().evaluate(policy=Zero(), dataset=swm.data.ReplayBuffer(9)), TypeError, "dataset: ReplayBuffer; exp"),

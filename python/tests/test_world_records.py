@@ -568,7 +568,8 @@ def test_settings_of_frames_are_recorded_and_compared(tmp_path):
     collected(path, RandomPolicy(), world=rooms(extra_wrappers=noise, wrap_goal=True), mode="overwrite", goal=True)
     refused(path, RandomPolicy(), "wrap_goal", rooms(extra_wrappers=noise), goal=True)
     # Without wrappers it has no effect.
-    collected(path, RandomPolicy(), world=rooms(wrap_goal=True), mode="overwrite", goal=True)
+    with pytest.warns(UserWarning, match="wrap_goal: there are no wrappers"):
+        collected(path, RandomPolicy(), world=rooms(wrap_goal=True), mode="overwrite", goal=True)
     assert collected(path, RandomPolicy(), 3, mode="resume", goal=True)["added"] == 1
 
 

@@ -229,6 +229,11 @@ pub struct Condition {
     pub variation: VariationRequest,
 }
 
+impl Condition {
+    /// The name of the condition without any shift.
+    pub const IN_DISTRIBUTION: &str = "in distribution";
+}
+
 impl EvalRequest {
     /// The layout that this version writes and reads.
     pub const VERSION: u32 = 1;

@@ -262,7 +262,7 @@ impl EvalRequest {
             planning_seed: self.planning_seed,
             videos: options.videos.as_ref().map(|(root, count)| Videos {
                 root: root.clone(),
-                prefix: format!("videos/{}-{}", slug(&policy.name), slug(&condition.name)),
+                prefix: format!("videos/{}", file_name(&policy.name, &condition.name)),
                 count: *count,
                 fps: 15,
                 frame_strip: options.frame_strip,
@@ -394,8 +394,34 @@ fn metrics(run: &Run) -> [(&'static str, f64); 3] {
     [("success_rate", success.rate), ("successes", success.successes as f64), ("episodes", success.n as f64)]
 }
 
+/// The names of a policy and of a condition as the name of a file. It has a part of their hash where other names could give the same words.
+fn file_name(policy: &str, condition: &str) -> String {
+    let words = format!("{}-{}", slug(policy), slug(condition));
+    if policy == slug(policy) && condition == Condition::IN_DISTRIBUTION {
+        return words;
+    }
+    let hash = swm_core::manifest::hash(format!("{policy}\0{condition}").as_bytes());
+    format!("{words}-{}", &hash[..8])
+}
+
 /// A name in the form of a file name: lower-case words joined by hyphens.
 fn slug(name: &str) -> String {
     let words: Vec<&str> = name.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
     words.join("-").to_lowercase()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_files_differ_where_policies_or_conditions_do() {
+        assert_eq!(file_name("lewm-rooms", Condition::IN_DISTRIBUTION), "lewm-rooms-in-distribution");
+        let names = ["a", "b", "a.b", "a_b", "A", "сеть", "модель", "x-angle"];
+        let conditions = [Condition::IN_DISTRIBUTION, "angle=1", "angle=-1", "in-distribution", "b in distribution"];
+        let files: std::collections::BTreeSet<String> =
+            names.iter().flat_map(|name| conditions.iter().map(|condition| file_name(name, condition))).collect();
+        assert_eq!(files.len(), names.len() * conditions.len());
+        assert!(files.iter().all(|file| file.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-')));
+    }
 }

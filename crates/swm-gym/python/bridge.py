@@ -516,7 +516,7 @@ class Bridge:
         # Values of goal columns that stay the same throughout the episode.
         self.held = []
         # Whether a step said if the goal is reached.
-        self.states_success = False
+        self.states_success, self.success = False, None
 
     def call(self, function, *arguments, **keywords):
         """Calls the environment. A child process that the environment forked does not continue: it would write into the
@@ -563,7 +563,7 @@ class Bridge:
         for leaf, view in self.factor_views:
             value = getattr(leaf, 'value', None)
             view[...] = np.asarray(leaf.init_value if value is None else value, np.float64).reshape(-1)
-        self.held = []
+        self.held, self.success = [], None
         self.write(observation, 0.0, False, False, info)
         if recorded is not None:
             self.set_recorded_state(**recorded)
@@ -582,17 +582,21 @@ class Bridge:
             value = numeric(info.get(key))
             if value is not None and value.shape == shape:
                 self.views[name][...] = value
-            elif not self.native and dtype.kind == 'f':
-                self.views[name][...] = math.nan
+            elif not self.native:
+                shown_now = 'shows the goal of the reset'
+                if dtype.kind == 'f':
+                    self.views[name][...] = math.nan
+                    shown_now = 'is NaN'
                 warnings.warn(
-                    f"'{name}' is NaN until the first step: the dataset has its values in another shape, and the environment"
+                    f"'{name}' {shown_now} until the first step: the dataset does not say what it is at the goal, and the environment"
                     ' has no method _get_info() that returns it',
                     stacklevel=2,
                 )
         shown, self.held = ([(self.views[name], argument(value)) for name, value in part.items()] for part in (shown, held))
         for view, value in [*shown, *self.held]:
             view[...] = np.reshape(value, view.shape)
-        # The header that the reset wrote describes another state.
+        # The header that the reset wrote, and its success, describe another state.
+        self.success = None
         HEAD.pack_into(self.buffer, 0, 0.0, math.inf, False, False, False)
 
     def present_info(self):
@@ -660,8 +664,13 @@ class Bridge:
         value = info.get(key)
         if value is None and key in info and self.states_success and (terminated or truncated):
             raise ValueError(f"info['{key}'] is None at the end of an episode: return True or False, as at earlier steps")
-        success = terminated if value is None else flag(value, f"info['{key}']")
-        self.states_success |= value is not None
+        if value is not None:
+            self.success = flag(value, f"info['{key}']")
+            self.states_success = True
+            success = self.success
+        else:
+            # An end is no success where the episode has said false last.
+            success = terminated and self.success is not False
         distance = info.get('goal_distance', math.inf)
         HEAD.pack_into(self.buffer, 0, float(reward), float(distance), terminated, truncated, success)
 

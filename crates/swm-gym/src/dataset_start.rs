@@ -4,7 +4,8 @@
 //! that the caller names, or methods that the bridge found by their names. These methods return no observation, so the
 //! columns take the values of the start row until the next step. Columns of the goal (`goal_NAME`) take the values of
 //! the goal row in the whole episode; where the goal row has none of their shape, those of the environment's `_get_info()`, and
-//! NaN until the next step if it has no such method.
+//! NaN until the next step if it has no such method. If a method is given values of the goal row, `desired_goal` of Gymnasium's goal
+//! environments takes the `achieved_goal` of that row until the next step, and a vector `info["goal"]` is that of `_get_info()`, or NaN.
 
 use crate::EnvLayout;
 use serde_json::{Value, json};
@@ -78,7 +79,7 @@ pub fn columns(layout: &EnvLayout, stored: &Schema, named: &[Callable]) -> Resul
     }
     for own in &layout.spec.columns {
         let name = flat(&own.name);
-        if let Some(index) = find(source(&name).1) {
+        for index in [find(source(&name).1), achieved(&name).and_then(|name| find(&name))].into_iter().flatten() {
             read[index] = true;
         }
     }
@@ -98,9 +99,18 @@ enum Source {
     Goal,
 }
 
+/// The column of a vector `info["goal"]`.
+const INFO_GOAL: &str = "info_goal";
+
 /// The row that a column is read from, and the column's name in that row.
 fn source(name: &str) -> (Source, &str) {
     goal_source(name).map_or((Source::Start, name), |name| (Source::Goal, name))
+}
+
+/// The column that says what a goal environment of Gymnasium has achieved, for its column `desired_goal`; `None` for others.
+fn achieved(name: &str) -> Option<String> {
+    let outer = name.strip_suffix("desired_goal")?;
+    (outer.is_empty() || outer.ends_with('_')).then(|| format!("{outer}achieved_goal"))
 }
 
 /// The flat name of the column that an argument names; `None` for a literal value.
@@ -152,7 +162,7 @@ pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
         let row = if row_of == Source::Goal { from.goal } else { from.start };
         row.schema().find(name).map(|index| array(row, index))
     };
-    let mut made = vec![];
+    let (mut made, mut sets_goal) = (vec![], false);
     let mut named = NAMED_METHODS.lock().unwrap_or_else(PoisonError::into_inner);
     for call in callables(layout, from.callables)? {
         if !named.contains(&call.method) {
@@ -162,7 +172,10 @@ pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
         for (key, argument) in &call.args {
             let given = match argument_column(argument)? {
                 None => argument.value.clone(),
-                Some(column) => value(&column).unwrap_or_default(),
+                Some(column) => {
+                    sets_goal |= source(&column).0 == Source::Goal;
+                    value(&column).unwrap_or_default()
+                }
             };
             arguments.insert(key.clone(), given);
         }
@@ -176,6 +189,19 @@ pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
         let (row_of, column) = source(&name);
         let stored = from.start.schema().find(column).map(|at| &from.start.schema().columns()[at]);
         let fits = stored.is_some_and(|stored| stored.len() == own.len());
+        // What the environment itself calls its goal, if a method has just set another.
+        if sets_goal && name == INFO_GOAL {
+            unknown.push(&own.name);
+            continue;
+        }
+        let reached = achieved(&name).filter(|_| sets_goal).and_then(|name| {
+            let index = from.goal.schema().find(&name)?;
+            (from.goal.schema().columns()[index].len() == own.len()).then(|| array(from.goal, index))
+        });
+        if let Some(value) = reached {
+            shown.insert(own.name.clone(), value);
+            continue;
+        }
         match value(&name).filter(|_| fits) {
             Some(value) if row_of == Source::Goal => _ = held.insert(own.name.clone(), value),
             Some(value) => _ = shown.insert(own.name.clone(), value),

@@ -85,14 +85,11 @@ impl GymEnv {
     /// # Errors
     /// When the defaults of its factors violate a constraint.
     pub fn with_layout(layout: Arc<EnvLayout>, transport: Box<dyn Transport>, restarts: usize) -> Result<Self> {
+        let filter = if layout.pixel_art() { PillowFilter::Nearest } else { PillowFilter::Triangle };
         let no_factors = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         Ok(Self {
             factors: layout.spec.variation_space.resolve(&no_factors, Key::new(0))?,
-            resizer: PillowResizer::new(if layout.pixel_art() {
-                PillowFilter::Nearest
-            } else {
-                PillowFilter::Triangle
-            }),
+            resizer: PillowResizer::new(filter),
             transport,
             layout,
             restarts,
@@ -219,7 +216,7 @@ impl GymEnv {
     fn finish_dispatched(&mut self) -> Result<()> {
         match self.dispatched {
             None => Ok(()),
-            Some(EnvCall::Reset) => self.run_reset(),
+            Some(EnvCall::Reset) => self.run_reset(true),
             Some(_) => self.run_step(),
         }
     }
@@ -232,10 +229,13 @@ impl GymEnv {
         self.frame_is_current = false;
     }
 
-    /// Makes the reset call of the episode and reads its factors.
-    fn run_reset(&mut self) -> Result<()> {
+    /// Makes the reset call of the episode and reads its factors; `checks` that the values are finite. At a recorded start, the bridge
+    /// writes NaN where a goal is unknown.
+    fn run_reset(&mut self, checks: bool) -> Result<()> {
         self.env_call(EnvCall::Reset)?;
-        self.layout.finite.check(&self.layout, self.transport.memory());
+        if checks {
+            self.layout.finite.check(&self.layout, self.transport.memory());
+        }
         let doubles = self.transport.memory()[self.layout.factors()].chunks_exact(size_of::<f64>());
         let values: Vec<f64> = doubles.map(bytemuck::pod_read_unaligned).collect();
         let space = &self.layout.spec.variation_space;
@@ -313,7 +313,7 @@ impl DatasetStartEnv for GymEnv {
         let mut arguments = reset_arguments(&self.layout, seed, &options)?;
         arguments["recorded"] = start::json(&self.layout, &from)?;
         self.start_episode(arguments.to_string(), GoalFrame::of(&from));
-        self.run_reset()
+        self.run_reset(false)
     }
 }
 
@@ -329,7 +329,7 @@ impl Env for GymEnv {
             self.finish_dispatched()?;
             self.start_episode(arguments, None);
         }
-        self.run_reset()
+        self.run_reset(true)
     }
 
     fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
@@ -458,7 +458,7 @@ impl Env for GymEnv {
             Some(at) => at,
             None => {
                 self.start_episode(reset, goal);
-                self.run_reset()?;
+                self.run_reset(false)?;
                 0
             }
         };

@@ -7,7 +7,7 @@ use crate::blocks::{BLOCK, transpose};
 use crate::panels::{Panels, WIDTH};
 use crate::product::{Columns, Rows, Segment, Then, multiply, multiply_panel};
 use crate::scratch::grown;
-use std::ops::Deref;
+use std::ops::{Deref, Range};
 
 /// A linear layer, or its gradient.
 #[derive(Clone, Debug)]
@@ -43,7 +43,7 @@ pub struct ReluTape(Vec<Vec<f32>>);
 pub struct ReluScratch {
     /// The gradients of the outputs of every layer before ReLU.
     gradients: Vec<Vec<f32>>,
-    /// The gradient of the inputs of the network.
+    /// The gradient of the inputs of the network, or of some of them.
     inputs: Vec<f32>,
     /// The transposed inputs of a layer, by the number of inputs.
     panels: Vec<Panels>,
@@ -89,20 +89,26 @@ impl<T: Deref<Target = [f32]>> ReluNetwork<T> {
         &tape.0[self.layers.len() - 1]
     }
 
-    /// Computes the gradient of the inputs of the network from the gradient `d` of its outputs.
+    /// Computes the gradient of a range of the inputs of the network from the gradient `d` of its outputs.
     ///
     /// # Shapes
-    /// `d` is `[blocks, outputs, BLOCK]`; returns `[blocks, inputs, BLOCK]`.
-    pub fn input_gradient<'a>(&self, tape: &ReluTape, d: &[f32], scratch: &'a mut ReluScratch) -> &'a [f32] {
+    /// `d` is `[blocks, outputs, BLOCK]`; returns `[blocks, range.len(), BLOCK]`.
+    pub fn input_gradient<'a>(
+        &self,
+        tape: &ReluTape,
+        d: &[f32],
+        range: Range<usize>,
+        scratch: &'a mut ReluScratch,
+    ) -> &'a [f32] {
         self.output_gradients(tape, d, scratch);
         let layer = &self.layers[0];
         let blocks = d.len() / (self.layers[self.layers.len() - 1].outputs() * BLOCK);
-        let inputs = grown(&mut scratch.inputs, blocks * layer.inputs() * BLOCK);
+        let inputs = grown(&mut scratch.inputs, blocks * range.len() * BLOCK);
         let of_outputs = scratch.gradients.first().map_or(d, Vec::as_slice);
         for block in 0..blocks {
-            let weight = Columns { values: &layer.weight, starts: layer.inputs() };
+            let weight = Columns { values: &layer.weight[range.start..], starts: layer.inputs() };
             let d = part(of_outputs, block, layer.outputs());
-            multiply_panel(weight, d, part_mut(inputs, block, layer.inputs()), Then::Nothing);
+            multiply_panel(weight, d, part_mut(inputs, block, range.len()), Then::Nothing);
         }
         inputs
     }
@@ -264,7 +270,11 @@ mod tests {
                 // A step across the edge of a ReLU changes the quotient.
                 assert!((found - expected).abs() < 2e-2 * expected.abs().max(5.0), "{found}, expected {expected}");
             };
-            let of_x = network.input_gradient(&tape, &d_blocks, &mut scratch).to_vec();
+            let of_x = network.input_gradient(&tape, &d_blocks, 0..inputs, &mut scratch).to_vec();
+            let last_inputs = inputs / 2..inputs;
+            let of_last = network.input_gradient(&tape, &d_blocks, last_inputs.clone(), &mut scratch);
+            let blocks = of_x.chunks_exact(inputs * BLOCK).map(|block| &block[last_inputs.start * BLOCK..]);
+            assert_eq!(of_last, blocks.collect::<Vec<_>>().concat(), "a range has the same values");
             for i in (0..x.len()).step_by(17) {
                 let [mut more, mut less] = [x.clone(), x.clone()];
                 more[i] += step;

@@ -91,7 +91,7 @@ impl Video {
     pub fn memory(&self) -> usize {
         let index = &self.index;
         let tables = index.samples.len() * size_of::<mp4::Sample>() + index.frames.len() * 12;
-        let sums = index.sums.as_ref().map_or(0, |sums| 4 * sums.len());
+        let sums = index.sums.as_ref().map_or(0, |sums| 4 * sums.values.len());
         let bytes = if let Source::Memory(_, bytes) = &self.source { bytes.len() } else { 0 };
         size_of::<Self>() + tables + sums + bytes
     }

@@ -105,7 +105,7 @@ def _run_in(scratch: Path, cell: Cell, run: Run) -> Any:
     for name, text in cell.get("files", {}).items():
         path = scratch / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
     arguments = [argument.replace(SCRATCH, str(scratch)) for argument in cell["arguments"]]
     state = TrainingState(cell["state"], scratch / cell.get("trains", "run")) if cell.get("state") else None
     continued = state is not None and state.restore()

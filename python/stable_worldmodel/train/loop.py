@@ -98,7 +98,7 @@ class Trainer:
         """
         if self.recorded or self.ranks.rank != 0:
             return
-        stored = json.loads((self.run / "checkpoint/state.json").read_text())["step"]
+        stored = json.loads((self.run / "checkpoint/state.json").read_text(encoding="utf-8"))["step"]
         if stored != self.step:
             raise ValueError(
                 f"{self.run}: another process has trained here, from step {self.step} to step {stored}; "
@@ -116,7 +116,7 @@ class Trainer:
             raw = read_safetensors(folder / "raw.safetensors")
             own = {self.model._checkpoint_name(name): name for name in stored_names(self.model)}
             self.model.load_state_dict({own[name]: value for name, value in raw.items()}, strict=False)
-        return json.loads((folder / "state.json").read_text())
+        return json.loads((folder / "state.json").read_text(encoding="utf-8"))
 
     def _loader(self, dataset: Any, settings: Mapping[str, Any]) -> Loader:
         goals = [

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from .pretrained import stored_names
 
-__all__ = ["load_into", "read_capsule", "read_safetensors", "read_state_dict"]
+__all__ = ["check_archive", "load_into", "read_capsule", "read_safetensors", "read_state_dict"]
 
 _TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "u1", "BOOL": "?"}
 #: The largest header of a file, in bytes.
@@ -78,7 +78,7 @@ def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     if Path(path).suffix == ".safetensors":
         return read_safetensors(path)
     _check_not_sparse(path)
-    _check_not_compressed(path)
+    check_archive(path)
     found: Any = torch.load(path, map_location="cpu", weights_only=True)
     if isinstance(found, Mapping) and isinstance(found.get("state_dict"), Mapping):
         found = found["state_dict"]
@@ -105,18 +105,30 @@ def _check_not_sparse(path: str | os.PathLike[str]) -> None:
     raise RuntimeError(f"{path}: it is a sparse file, {size}; get it again from where it comes from")
 
 
-def _check_not_compressed(path: str | os.PathLike[str]) -> None:
-    """Refuses an archive with compressed members, which `torch.save` does not write: they may be of any size.
+def check_archive(path: str | os.PathLike[str]) -> None:
+    """Refuses an archive with compressed members, which `torch.save` does not write and which may be of any size, and one whose
+    members differ from their checksums, which `torch.load` does not compare.
 
     Raises:
-        RuntimeError: If a member is compressed.
+        RuntimeError: If a member is compressed or damaged.
     """
     if not zipfile.is_zipfile(path):
         return
-    with zipfile.ZipFile(path) as archive:
-        for member in archive.infolist():
-            if member.compress_type != zipfile.ZIP_STORED:
-                raise RuntimeError(f"{path}: {member.filename!r} is compressed; expected a file that torch.save wrote")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            if len(set(names)) < len(names):
+                twice = next(name for name in names if names.count(name) > 1)
+                raise RuntimeError(f"{path}: {twice!r} is in it twice; get the file again from where it comes from")
+            for member in archive.infolist():
+                if member.compress_type != zipfile.ZIP_STORED:
+                    raise RuntimeError(f"{path}: {member.filename!r} is compressed; expected a file that torch.save wrote")
+            # torch can leave out the checksums (`torch.serialization.set_crc32_options`).
+            damaged = archive.testzip() if any(member.CRC for member in archive.infolist()) else None
+    except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as error:
+        raise RuntimeError(f"{path}: it is damaged ({error}); get it again from where it comes from") from error
+    if damaged is not None:
+        raise RuntimeError(f"{path}: {damaged!r} is damaged, its checksum differs; get the file again from where it comes from")
 
 
 def load_into(model: nn.Module, weights: Mapping[str, Tensor], source: str) -> None:

@@ -97,8 +97,8 @@ def _parts(path: Path) -> tuple[Stored, dict[str, Tensor]] | None:
     if folder is None:
         return None
     manifest = folder / "manifest.json"
-    provenance = json.loads(manifest.read_text()) if manifest.is_file() else {}
-    return Stored(json.loads((folder / "config.json").read_text()), provenance), read_safetensors(
+    provenance = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
+    return Stored(json.loads((folder / "config.json").read_text(encoding="utf-8")), provenance), read_safetensors(
         folder / "weights.safetensors"
     )
 

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from ._weights import check_archive
+
 __all__ = ["attach_probe", "get_probe", "load_probe"]
 
 
@@ -31,6 +33,7 @@ def load_probe(model: nn.Module, key: str, path: str | os.PathLike[str]) -> None
 
     Files that hold a module are refused, because reading them runs code of the file: save `probe.state_dict()`.
     """
+    check_archive(path)
     weights = torch.load(path, map_location="cpu", weights_only=True)
     probe = get_probe(model, key)
     if probe is None:

@@ -126,7 +126,7 @@ def _state(path: Path) -> tuple[int, int] | None:
 def _is_results(path: Path) -> bool:
     """Whether a file holds results of an evaluation."""
     try:
-        found = json.loads(path.read_text())
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     return isinstance(found, dict) and {"manifest", "runs"} <= found.keys()

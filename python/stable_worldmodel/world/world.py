@@ -131,6 +131,8 @@ class World:
         self._image = image
         #: The Gymnasium environments of this world that run in this interpreter.
         self.gym_envs: list[Any] = []
+        if wrap_goal and not wrappers:
+            warnings.warn("wrap_goal: there are no wrappers, so that it has no effect", stacklevel=2)
         if in_engine is None and workers:
             raise ValueError("workers: user-defined wrappers cannot run in worker processes; use workers=False")
         if not (self._native or (in_engine is not None and workers)):
@@ -792,6 +794,11 @@ class World:
             raise ValueError("videos: no folder is named; pass video=… as well")
         episodes = 50 if episodes is None else _options.count("episodes", episodes)
         hold = _options.count("hold", hold)
+        if hold != 1 and protocol == "compat":
+            problem = "with the compat protocol, one step that satisfies the goal ends an episode"
+            raise ValueError(f"hold: {hold}; {problem}; leave it out, or use protocol='strict'")
+        if callables and dataset is None:
+            warnings.warn("callables: without a dataset there are no recorded states to set; none is called", stacklevel=2)
         variation = _options.variation(_without_states(options), self.spec["variation"])
         config = {
             "episodes": episodes,

@@ -38,7 +38,7 @@ const MAX_LISTED: usize = 1_000_000;
 /// The variable with the token.
 const TOKEN: &str = "HF_TOKEN";
 /// The header with the hub's kind of error, and that with its message.
-const ERROR_CODE: &str = "x-error-code";
+pub(super) const ERROR_CODE: &str = "x-error-code";
 const ERROR_MESSAGE: &str = "x-error-message";
 
 /// A connection to the hub.
@@ -123,12 +123,23 @@ impl Client {
 
     /// The commit of a revision.
     pub fn commit(&self, uri: &HubUri) -> Result<String> {
+        let url = self.revision(uri);
+        self.commit_of(&url, self.send(Method::GET, &url, Body::default(), HeaderMap::new(), true)?, uri)
+    }
+
+    /// The address of a revision.
+    pub fn revision(&self, uri: &HubUri) -> String {
+        format!("{}/revision/{}", self.api(uri), encoded(&uri.revision))
+    }
+
+    /// The commit that an answer about a revision states.
+    pub fn commit_of(&self, url: &str, answer: Response, uri: &HubUri) -> Result<String> {
         #[derive(Deserialize)]
         struct Found {
             sha: String,
         }
-        let url = format!("{}/revision/{}", self.api(uri), encoded(&uri.revision));
-        let found: Found = self.json(Method::GET, &url, Body::default(), uri)?;
+        self.check(&answer, uri)?;
+        let found: Found = parsed(url, &whole(url, answer)?)?;
         if super::uri::is_commit(&found.sha) {
             return Ok(found.sha);
         }
@@ -192,18 +203,6 @@ impl Client {
         }
         let problem = format!("its list of files has more than {MAX_PAGES} pages, or {MAX_LISTED} files");
         Err(Error::corrupt(url, problem, "name a smaller repository"))
-    }
-
-    /// Sends a request with the token and reads the answer as JSON.
-    pub fn json<T: serde::de::DeserializeOwned>(
-        &self,
-        method: Method,
-        url: &str,
-        body: Body,
-        uri: &HubUri,
-    ) -> Result<T> {
-        let (_, bytes) = self.bytes(method, url, body, uri)?;
-        parsed(url, &bytes)
     }
 
     /// Sends a request with the token; returns the headers and the body of the answer.

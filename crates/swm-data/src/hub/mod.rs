@@ -11,6 +11,7 @@ mod commit_line;
 mod download;
 mod pace;
 mod pointer;
+mod replaced;
 mod upload;
 mod uri;
 

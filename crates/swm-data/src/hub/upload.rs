@@ -1,6 +1,6 @@
 //! [`Hub::push`]: uploads files as one commit.
 
-use super::client::{Body, Client, Content, header, json_body, named, parsed, whole};
+use super::client::{Body, Client, Content, ERROR_CODE, header, json_body, named, parsed, whole};
 use super::commit_line::Line;
 use super::download::sha256;
 use super::{Hub, HubUri, RepoKind};
@@ -113,7 +113,8 @@ impl Hub {
     /// ones that the hub has already are not sent again, so an interrupted upload continues.
     ///
     /// # Errors
-    /// When there is nothing to upload, the token may not write, a file is too large, or the hub cannot be reached.
+    /// When there is nothing to upload, the token may not write, a file is too large, the repository has another dataset at this path, or
+    /// the hub cannot be reached.
     pub fn push(&self, from: &Path, to: &HubUri, options: &PushOptions, control: &mut Control<'_>) -> Result<Pushed> {
         if to.is_pinned() {
             let fix = "name a branch, or none for main";
@@ -121,7 +122,14 @@ impl Hub {
         }
         let uploads = uploads(from, &to.path, control)?;
         let (total, bytes) = (uploads.len(), uploads.iter().map(|upload| upload.size).sum());
-        self.client.create(to, options.private)?;
+        let exists = !self.client.create(to, options.private)?;
+        let paths = uploads.iter().map(|upload| upload.path.as_str()).collect();
+        if exists
+            && super::replaced::may_mix(&paths)
+            && let Some(commit) = self.client.newest(to)?
+        {
+            super::replaced::check(to, &self.client.files(to, &commit, control)?, &paths)?;
+        }
         let large = self.client.large(to, &uploads)?;
         let name = to.to_string();
         control.emit(Event::Started(Stage { name: STAGE, subject: &[&name], total, unit: "files" }));
@@ -148,18 +156,27 @@ impl Hub {
 }
 
 impl Client {
-    /// Makes a repository if it does not exist.
-    fn create(&self, to: &HubUri, private: bool) -> Result<()> {
+    /// The commit of a branch; `None` if there is no such branch, as in a repository without a commit.
+    fn newest(&self, uri: &HubUri) -> Result<Option<String>> {
+        let url = self.revision(uri);
+        let answer = self.send(Method::GET, &url, Body::default(), HeaderMap::new(), true)?;
+        if answer.headers().get(ERROR_CODE).is_some_and(|code| code == "RevisionNotFound") {
+            return Ok(None);
+        }
+        self.commit_of(&url, answer, uri).map(Some)
+    }
+
+    /// Makes a repository; returns false if it exists already.
+    fn create(&self, to: &HubUri, private: bool) -> Result<bool> {
         let (owner, name) = to.repo.split_once('/').unwrap_or_default();
         let kind = if to.kind == RepoKind::Dataset { "dataset" } else { "model" };
         let url = format!("{}/api/repos/create", self.endpoint());
         let body = json!({"name": name, "organization": owner, "type": kind, "private": private});
         let answer = self.send(Method::POST, &url, json_body(&body), HeaderMap::new(), true)?;
-        // It exists already.
         if answer.status() == reqwest::StatusCode::CONFLICT {
-            return Ok(());
+            return Ok(false);
         }
-        self.check_write(&answer, to)
+        self.check_write(&answer, to).map(|()| true)
     }
 
     /// Checks the status of an answer to a request that writes.

@@ -3,7 +3,7 @@
 use crate::request::{EvalRequest, StartsRequest};
 use crate::until::{ONE_START, SEVERAL_STARTS};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use swm_core::results::{Counting, Published, Ray, Until};
 use swm_core::{Error, Result, manifest};
 
@@ -168,6 +168,25 @@ impl Study {
                     cell.policy()
                 );
                 return Err(Error::config("the study", problem, "remove one of them"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that no two cells of a new study have the same names: results are listed, and compared, by name.
+    ///
+    /// # Errors
+    /// When starts, condition, policy, variables, seeds and counting of two cells are equal.
+    pub fn check_names(&self) -> Result<()> {
+        let variables: BTreeSet<&str> =
+            self.cells.iter().flat_map(|cell| cell.variables.keys().map(String::as_str)).collect();
+        let mut seen = BTreeSet::new();
+        for cell in &self.cells {
+            let named = (cell.condition(), super::rows::key(cell, &variables));
+            if !seen.insert(named) {
+                let what = format!("'{}' of {}", cell.condition(), cell.policy());
+                let problem = "two cells have this name: their starts, condition, policy, variables and seed are equal";
+                return Err(Error::config(what, problem, "give conditions, policies and starts different names"));
             }
         }
         Ok(())

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::files::{self, Lock};
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{ColumnSpec, EnvPool, Error, Key, Policy, RandomPolicy, Result, Schema};
+use swm_core::{ColumnSpec, EnvPool, Error, Key, Policy, RandomPolicy, Result, Schema, manifest};
 use swm_data::{LoaderConfig, ReplayBuffer, ReplayConfig, ReplayLoader, WriteOptions};
 
 /// The result of an online run.
@@ -396,7 +396,8 @@ impl Run<'_> {
             self.data.replay.save(folder.join(REPLAY), WriteOptions::default())?;
             let path = folder.join(COLLECTOR);
             let state = self.data.collector.state(self.explorer.memory());
-            std::fs::write(&path, json!(state).to_string())
+            let text = json!(state).to_string();
+            std::fs::write(&path, format!("{text}\n{}", manifest::hash(text.as_bytes())))
                 .map_err(|error| Error::io(&path, "saving the state of the episodes", error))?;
         }
         let weights = self.learner.learner().save(self.out)?;
@@ -439,11 +440,17 @@ fn saved_data(out: &Path, step: usize) -> PathBuf {
 /// The limit of the size of the file with the running episodes, in bytes.
 const LARGEST_STATE: u64 = 1 << 30;
 
+/// Reads the state of the running episodes, with its hash in the second line, which earlier programs did not write.
 fn read_collector(folder: &Path) -> Result<CollectorState> {
     let path = folder.join(COLLECTOR);
-    let text = files::read(&path, LARGEST_STATE)?;
-    serde_json::from_slice(&text)
-        .map_err(|error| Error::corrupt(&path, error.to_string(), "train again from the beginning"))
+    let damaged = |problem: String| Error::corrupt(&path, problem, "train again from the beginning");
+    let bytes = files::read(&path, LARGEST_STATE)?;
+    let mut lines = bytes.split(|byte| *byte == b'\n');
+    let text = lines.next().unwrap_or_default();
+    match lines.next() {
+        Some(hash) if hash != manifest::hash(text).as_bytes() => Err(damaged("its hash differs".to_owned())),
+        _ => serde_json::from_slice(text).map_err(|error| damaged(error.to_string())),
+    }
 }
 
 fn mean(values: &[f64]) -> f64 {

@@ -203,11 +203,8 @@ fn policy_part(
             if row < range.len() && usize::from(*is_second) == index { -weight } else { 0.0 }
         };
         let d: Vec<f32> = is_second.iter().enumerate().map(of_q).collect();
-        let of_x = networks.critics[index].input_gradient(tape, &d, scratch);
-        let blocks = of_actions.chunks_exact_mut(width * BLOCK).zip(of_x.chunks_exact(features * BLOCK));
-        for (sum, of_x) in blocks {
-            sum.iter_mut().zip(&of_x[rows.inputs * BLOCK..]).for_each(|(sum, d)| *sum += d);
-        }
+        let gradient = networks.critics[index].input_gradient(tape, &d, rows.inputs..features, scratch);
+        of_actions.iter_mut().zip(gradient).for_each(|(sum, d)| *sum += d);
     }
     let output = networks.actor.outputs(of_actor);
     let mut d = vec![0.0; output.len()];

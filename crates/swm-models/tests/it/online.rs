@@ -133,6 +133,16 @@ fn check_resuming<M: Agent>() {
     let refused = run(&config, &resumed, &options, 0).expect_err("the folder holds a run").to_string();
     assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
+    // A changed number of the running episodes is noticed.
+    let place = resumed.join("played-10/place.json");
+    let stored = std::fs::read(&place).expect("reading the running episodes");
+    let mut changed = stored.clone();
+    let digit = changed.iter_mut().find(|byte| byte.is_ascii_digit()).expect("a number");
+    *digit = if *digit == b'1' { b'2' } else { b'1' };
+    std::fs::write(&place, changed).expect("writing");
+    let damaged = run(&config, &resumed, &resume, 0).expect_err("damaged episodes").to_string();
+    assert!(damaged.contains("its hash differs"), "{damaged}");
+    std::fs::write(&place, stored).expect("writing");
     let second = run(&config, &resumed, &resume, 0).expect("training the model");
     assert_eq!((second.steps, second.interrupted), (24, false));
     assert_eq!(files(&complete), files(&resumed));

@@ -15,7 +15,10 @@ use tables::{Description, description, samples};
 const LARGEST_TABLES: u64 = 256 << 20;
 
 /// Identifier of the box with checksums that [`seal`] appends.
-const SEAL: [u8; 16] = *b"swm frame sums 1";
+const SEAL: [u8; 16] = *b"swm frame sums 2";
+
+/// That of files that earlier programs wrote, whose checksums are [`weak_sum`]s.
+const WEAK_SEAL: [u8; 16] = *b"swm frame sums 1";
 
 type Result<T> = std::result::Result<T, String>;
 
@@ -67,7 +70,15 @@ pub struct Index {
     /// Track units per second.
     pub timescale: u32,
     /// Checksums of the samples, in files that [`seal`] finished.
-    pub sums: Option<Vec<u32>>,
+    pub sums: Option<Sums>,
+}
+
+/// Checksums of samples.
+#[derive(Clone, Debug)]
+pub struct Sums {
+    pub values: Vec<u32>,
+    /// Computes one.
+    of: fn(&[u8]) -> u32,
 }
 
 impl Index {
@@ -108,10 +119,12 @@ impl Index {
                 b"uuid" => {
                     let bytes = body(LARGEST_TABLES)?;
                     let matching = bytes.iter().zip(&SEAL).filter(|(a, b)| a == b).count();
-                    match bytes.strip_prefix(&SEAL) {
-                        Some(sums) => seal = Some(sums.to_vec()),
-                        None if matching > SEAL.len() / 2 => return Err("has damaged checksums".to_owned()),
-                        None => {}
+                    if let Some(sums) = bytes.strip_prefix(&SEAL) {
+                        seal = Some((sums.to_vec(), sum as fn(&[u8]) -> u32));
+                    } else if let Some(sums) = bytes.strip_prefix(&WEAK_SEAL) {
+                        seal = Some((sums.to_vec(), weak_sum));
+                    } else if matching > SEAL.len() / 2 {
+                        return Err("has damaged checksums".to_owned());
                     }
                 }
                 b"moof" | b"styp" | b"sidx" => return Err("is cut into fragments".to_owned()),
@@ -123,12 +136,12 @@ impl Index {
         }
         let moov = moov.ok_or("holds no sample tables (box 'moov')")?;
         let mut index = Self::of_moov(&moov, length)?;
-        if let Some(seal) = seal {
+        if let Some((seal, of)) = seal {
             let mut sums = seal.chunks_exact(4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
-            if sums.next() != Some(sum(&moov)) || seal.len() != 4 * (index.samples.len() + 1) {
+            if sums.next() != Some(of(&moov)) || seal.len() != 4 * (index.samples.len() + 1) {
                 return Err("has sample tables that do not match their checksum".to_owned());
             }
-            index.sums = Some(sums.collect());
+            index.sums = Some(Sums { values: sums.collect(), of });
         }
         Ok(index)
     }
@@ -187,7 +200,7 @@ impl Index {
             return Err(format!("is damaged: its encoded frame {sample} is empty"));
         }
         match &self.sums {
-            Some(sums) if sums[sample] != sum(bytes) => {
+            Some(sums) if sums.values[sample] != (sums.of)(bytes) => {
                 Err(format!("is damaged in encoded frame {sample}: its checksum differs"))
             }
             _ => Ok(()),
@@ -231,22 +244,35 @@ pub fn seal(file: &mut Vec<u8>) -> Result<()> {
     Ok(())
 }
 
-/// Returns a checksum against accidental damage. Every step is one-to-one, so the 64-bit state differs whenever one
-/// word differs.
+/// Returns a checksum against accidental damage.
 pub fn sum(bytes: &[u8]) -> u32 {
-    const ODD: u64 = 0x9e37_79b9_7f4a_7c15;
-    let mut sum = ODD ^ bytes.len() as u64;
-    let mut add = |word: [u8; 8]| {
-        sum = (sum ^ u64::from_le_bytes(word)).wrapping_mul(ODD);
-        sum ^= sum >> 32;
-    };
+    // A step more than the words, because the last step alone does not spread the upper half of its word.
+    step(state(bytes), 0) as u32
+}
+
+/// Returns the checksum of earlier programs. Its last step drops the upper half of the last word: up to 3 bytes at the end of 5 to 7 bytes
+/// beyond a multiple of 8.
+fn weak_sum(bytes: &[u8]) -> u32 {
+    let state = state(bytes);
+    (state >> 32) as u32 ^ state as u32
+}
+
+/// Every step is one-to-one, so the state differs whenever one word differs.
+fn state(bytes: &[u8]) -> u64 {
     let (words, rest) = bytes.as_chunks::<8>();
-    words.iter().copied().for_each(&mut add);
     let mut last = [0; 8];
     last[..rest.len()].copy_from_slice(rest);
-    add(last);
-    (sum >> 32) as u32 ^ sum as u32
+    let words = words.iter().chain([&last]).map(|word| u64::from_le_bytes(*word));
+    words.fold(ODD ^ bytes.len() as u64, step)
 }
+
+fn step(state: u64, word: u64) -> u64 {
+    let state = (state ^ word).wrapping_mul(ODD);
+    state ^ state >> 32
+}
+
+/// The odd number that spreads the bits of a word.
+const ODD: u64 = 0x9e37_79b9_7f4a_7c15;
 
 /// Returns the units per second in the header of a movie or a track.
 fn timescale(header: &[u8]) -> Result<u32> {
@@ -292,4 +318,23 @@ fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
         start = start.saturating_add(units);
     }
     if pieces > 1 { Err("is edited from several pieces".to_owned()) } else { Ok(edit) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn checksums_depend_on_every_byte_and_those_of_earlier_programs_are_known() {
+        for length in 1..40 {
+            let bytes: Vec<u8> = (0..length).map(|i: u8| i.wrapping_mul(7).wrapping_add(3)).collect();
+            for at in 0..bytes.len() {
+                let mut changed = bytes.clone();
+                changed[at] ^= 0x10;
+                assert_ne!(sum(&changed), sum(&bytes), "byte {at} of {length}");
+            }
+        }
+        // The value that earlier programs compute.
+        assert_eq!(weak_sum(b"swm frame"), 0xe590b808);
+    }
 }

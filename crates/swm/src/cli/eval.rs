@@ -19,7 +19,7 @@ use swm_core::limits::{ENVS, EVALUATED_EPISODES, STEPS};
 use swm_core::results::{Counting, Until};
 use swm_core::{EnvChoice, Error, Key, Origin, Result, Results, files};
 use swm_data::{Part, Split};
-use swm_eval::{Condition, EvalRequest, HeldOut, PolicyKind, RunOptions, StartsRequest, publish};
+use swm_eval::{Condition, EvalRequest, HeldOut, Model, PolicyKind, PolicyRequest, RunOptions, StartsRequest, publish};
 
 /// Arguments of `swm eval`.
 #[derive(Args)]
@@ -132,7 +132,7 @@ pub struct EvalArgs {
 }
 
 /// The rule for counting episodes.
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Protocol {
     /// Starts that are solved already do not count
     Strict,
@@ -164,9 +164,6 @@ pub const VIDEOS: usize = 3;
 /// The file of the searches of all plans.
 pub(super) const TRACES: &str = "traces.json";
 
-/// The name of the condition without any shift.
-const IN_DISTRIBUTION: &str = "in distribution";
-
 /// Runs `swm eval`.
 pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
     let (results, file) = run_args(args, context)?;
@@ -184,7 +181,7 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     let resolver = HomeResolver::new(Origin::User).on(args.device.open()?);
     let resolver = if args.trace { resolver.tracing() } else { resolver };
     let request = args.request(&resolver, CapsuleStarts::Use)?;
-    args.check_planning(&request)?;
+    args.check_effects(&request)?;
     if let StartsRequest::Dataset { dataset, .. } = &request.starts
         && let Some(warning) = warning_of_starts(dataset, &request.env)
     {
@@ -267,9 +264,19 @@ impl EvalArgs {
         })
     }
 
-    /// Checks that a policy plans, if an option of planning is given.
-    pub(super) fn check_planning(&self, request: &EvalRequest) -> Result<()> {
+    /// Checks that the options of planning and counting have an effect.
+    pub(super) fn check_effects(&self, request: &EvalRequest) -> Result<()> {
+        if self.hold != 1 && self.protocol == Protocol::Compat {
+            let problem = "with the compat protocol, one step that satisfies the goal ends an episode";
+            return Err(Error::config(format!("--hold {}", self.hold), problem, "remove it, or use --protocol strict"));
+        }
         let plans = request.policies.iter().any(|policy| matches!(policy.kind, PolicyKind::Plan { .. }));
+        let simulates =
+            |policy: &PolicyRequest| matches!(&policy.kind, PolicyKind::Plan { model: Model::Simulator { .. }, .. });
+        if let Some(option) = self.planner.of_simulator().filter(|_| !request.policies.iter().any(simulates)) {
+            let problem = "none of the policies plans in the simulator";
+            return Err(Error::config(option, problem, "remove it, or evaluate the policy 'simulator'"));
+        }
         let option = match plans {
             false if self.trace => "--trace",
             false if self.planner.is_given() => "an option of planning (--solver, --horizon, --limit, …)",
@@ -345,9 +352,9 @@ impl EvalArgs {
 
     /// Returns the name of a condition: its shifted factors and its wrappers.
     fn condition_name(&self, variation: &VariationArgs) -> String {
-        let variation = Some(variation.describe()).filter(|shift| shift != IN_DISTRIBUTION);
+        let variation = Some(variation.describe()).filter(|shift| shift != Condition::IN_DISTRIBUTION);
         let shifts: Vec<String> = variation.into_iter().chain(self.wrappers.wrappers.iter().cloned()).collect();
-        if shifts.is_empty() { IN_DISTRIBUTION.to_owned() } else { shifts.join(", ") }
+        if shifts.is_empty() { Condition::IN_DISTRIBUTION.to_owned() } else { shifts.join(", ") }
     }
 }
 

@@ -28,7 +28,7 @@ pub struct PlannerArgs {
     /// Environment steps per model step of the simulator
     ///
     /// A checkpoint has its own action block.
-    #[arg(long, default_value_t = 5, value_name = "STEPS")]
+    #[arg(long, default_value_t = ACTION_BLOCK, value_name = "STEPS")]
     pub action_block: usize,
     /// Do not initialise a plan with the remaining steps of the previous plan
     #[arg(long)]
@@ -51,9 +51,13 @@ pub struct PlannerArgs {
     #[arg(long = "limit", value_name = "NAME[,KEY=VALUE…]")]
     pub limits: Vec<String>,
     /// Score of simulated plans: terminal, running, reach, success or reward
-    #[arg(long, default_value = "terminal")]
+    #[arg(long, default_value = SCORE)]
     pub score: String,
 }
+
+/// The default score of simulated plans, and the environment steps per model step of the simulator.
+const SCORE: &str = "terminal";
+const ACTION_BLOCK: usize = 5;
 
 /// The default horizon and receding horizon, in model steps.
 const HORIZON: usize = 5;
@@ -72,6 +76,12 @@ impl PlannerArgs {
             || self.cold_start
             || self.latency_budget.is_some()
             || self.fast
+    }
+
+    /// Returns the option that only plans in the simulator use, if one is given.
+    pub fn of_simulator(&self) -> Option<&'static str> {
+        let score = (self.score != SCORE).then_some("--score");
+        score.or_else(|| (self.action_block != ACTION_BLOCK).then_some("--action-block"))
     }
 
     /// Returns the solvers with complete settings. Without --solver, this is the first solver for the environment's

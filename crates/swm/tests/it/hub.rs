@@ -248,6 +248,16 @@ fn a_dataset_and_a_checkpoint_go_to_the_hub_and_come_back() {
     // The same files again are not sent.
     assert_eq!(setup.json(&push, Some(TOKEN))["uploaded"], 0);
 
+    // A new dataset does not disappear under newer commits of an older one of the same name.
+    let more = "collect swm/TwoRoom-v1 --output rooms --episodes 20 --image 64 --resume --max-steps 30";
+    setup.json(&more.split(' ').collect::<Vec<_>>(), None);
+    setup.json(&push, Some(TOKEN));
+    std::fs::rename(setup.swm.path("datasets/rooms.lance"), setup.swm.path("datasets/kept.lance")).expect("renaming");
+    setup.json(&[&collect[..], &["--seed", "9"]].concat(), None);
+    setup.fails(&push, Some(TOKEN), &["has another dataset there", "'rooms.lance/_versions/", "push to another path"]);
+    std::fs::remove_dir_all(setup.swm.path("datasets/rooms.lance")).expect("removing");
+    std::fs::rename(setup.swm.path("datasets/kept.lance"), setup.swm.path("datasets/rooms.lance")).expect("renaming");
+
     let uri = "hf://datasets/lab/rooms/rooms.lance";
     let [local, remote] = ["rooms", uri].map(|name| setup.json(&["inspect", name, "--checksum"], Some(TOKEN)));
     assert_eq!(local["checksum"], remote["checksum"]);

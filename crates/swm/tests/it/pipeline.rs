@@ -176,6 +176,10 @@ fn eval_records_protocol_split_and_hold_and_rejects_unknown_settings() {
     assert!(test["runs"][0]["episodes"][0]["start"].is_array());
     let compat = run(&["--protocol", "compat"]);
     assert!(compat["manifest"]["config"]["counting"]["compat"]["envs"].is_u64());
+    swm.fails(&[&expert[..], &["--protocol", "compat", "--hold", "3"]].concat(), 2, &["--hold 3", "--protocol strict"]);
+    for (option, value) in [("--score", "reach"), ("--action-block", "3")] {
+        swm.fails(&[&expert[..], &[option, value]].concat(), 2, &[option, "plans in the simulator"]);
+    }
     let searches = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "3", "--budget", "10", "-o", "found"];
     let small = ["--solver", "cem,samples=8,elites=2,iterations=2", "--solver", "cem,samples=9,elites=2,iterations=2"];
     let found = swm.json(&[&searches[..], &small].concat());

@@ -319,6 +319,11 @@ fn errors_in_a_study_name_the_line_and_the_nearest_word() {
         ("source = \"a table\"", "sources = \"a table\"", vec!["study.toml:29", "sources", "source"]),
         ("source = \"a table\"", "", vec!["study.toml:28", "no source"]),
         ("name = \"chance\"", "name = \"chance\\nswm: done\"", vec!["study.toml:", "several lines"]),
+        (
+            "name = \"chance\"\npolicy = \"random\"",
+            "name = \"planner\"\npolicy = \"no-op\"",
+            vec!["of planner", "two cells have this name", "different names"],
+        ),
     ] {
         assert!(STUDY.contains(from), "{from}");
         std::fs::write(swm.path("study.toml"), STUDY.replace(from, to)).expect("writing the study");

@@ -221,6 +221,10 @@ def _policy(path: str | os.PathLike[str]) -> Any:
                 raise ValueError(f"its settings have more than {_MOST_SETTINGS} bytes")
             if stored > max(8 * os.path.getsize(path), _MOST_SETTINGS):
                 raise ValueError("its weights are more than 8 times larger than the file")
+            # At its end, the checksum is compared.
+            while file.read(1 << 20):
+                pass
+            file.seek(0)
             weights = torch.load(file, map_location="cpu", weights_only=True)
             settings = json.loads(archive.read("data"))
     except OSError:

@@ -44,7 +44,7 @@ pub fn run(command: &EvalCommand, context: &Context) -> anyhow::Result<()> {
     let resolver = HomeResolver::new(Origin::User).on(args.device.open()?);
     let resolver = if args.trace { resolver.tracing() } else { resolver };
     let request = args.request(&resolver, CapsuleStarts::Use)?;
-    args.check_planning(&request)?;
+    args.check_effects(&request)?;
     let results = match (part, join) {
         (Some(index), _) => command.evaluate_part(&request.part(*index)?, &resolver, context)?,
         (None, Some(parts)) => command.join_parts(parts, &request, &resolver, context)?,

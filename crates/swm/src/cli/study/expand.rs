@@ -76,6 +76,7 @@ pub fn study(
         arguments: vec![],
     };
     study.check()?;
+    study.check_names()?;
     Ok(study)
 }
 

@@ -9,12 +9,17 @@
 //!
 //! Of single precision, products are computed with AVX-512 where the processor has it, in tiles whose elements are summed one by one
 //! like those of AVX2. Products of rows with columns are the exception: their sums are over the lanes of a vector, so that they
-//! are computed with AVX2 everywhere.
+//! are computed with AVX2 everywhere. All but small products are laid out for these kernels in `tiles.rs`.
 
 #![allow(unsafe_code, reason = "products are computed on pointers, as Burn gives them")]
 
 use core::any::TypeId;
 pub use gemm_common::Parallelism;
+
+#[cfg(target_arch = "x86_64")]
+mod single;
+#[cfg(target_arch = "x86_64")]
+mod tiles;
 
 /// The longest sum that the kernels do not cut, whatever the caches.
 const BLOCK: usize = 512;
@@ -33,6 +38,7 @@ struct Product<T> {
 }
 
 /// The first element of a matrix, and the distances between neighbours along a row (from column to column) and along a column.
+#[derive(Clone, Copy)]
 struct Matrix<P> {
     first: P,
     to_next_column: isize,
@@ -94,6 +100,33 @@ impl<P> Matrix<P> {
     }
 }
 
+/// Pointers to elements.
+trait Pointer: Copy {
+    /// Returns the pointer to the element at a distance, in elements.
+    fn offset(self, distance: isize) -> Self;
+}
+
+impl<T> Pointer for *const T {
+    fn offset(self, distance: isize) -> Self {
+        self.wrapping_offset(distance)
+    }
+}
+
+impl<T> Pointer for *mut T {
+    fn offset(self, distance: isize) -> Self {
+        self.wrapping_offset(distance)
+    }
+}
+
+impl<P: Pointer> Matrix<P> {
+    /// Returns the matrix below and to the right of an element.
+    #[inline(always)]
+    fn at(&self, row: usize, column: usize) -> Self {
+        let distance = row as isize * self.to_next_row + column as isize * self.to_next_column;
+        Self { first: self.first.offset(distance), ..*self }
+    }
+}
+
 /// A kernel: as [`gemm()`], for one type.
 type Kernel<T> = unsafe fn(
     usize,
@@ -117,141 +150,80 @@ type Kernel<T> = unsafe fn(
     Parallelism,
 );
 
-/// The kernels of single precision on x86, by the instructions that they use. Whatever the width of its vectors, a kernel computes
-/// an element of the result as one sum in the order of its terms, except in products of rows with columns.
-#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
-mod single {
-    use super::{Kernel, Parallelism};
-    use gemm_common::gemm::gemm_basic_generic;
-    use gemm_common::simd::{V3, V4};
-    use gemm_f32::microkernel;
+/// The factors of a product: of the destination, none if it is not read, and of the product of the two other matrices.
+type Factors<T> = (Option<T>, T);
 
-    macro_rules! kernel {
-        ($name:ident, $simd:ty, $lanes:literal) => {
-            /// A kernel: as [`gemm()`](super::gemm()).
-            #[allow(clippy::too_many_arguments, clippy::fn_params_excessive_bools, reason = "the type of kernels")]
-            pub unsafe fn $name(
-                m: usize,
-                n: usize,
-                k: usize,
-                dst: *mut f32,
-                dst_cs: isize,
-                dst_rs: isize,
-                read_dst: bool,
-                lhs: *const f32,
-                lhs_cs: isize,
-                lhs_rs: isize,
-                rhs: *const f32,
-                rhs_cs: isize,
-                rhs_rs: isize,
-                alpha: f32,
-                beta: f32,
-                conj_dst: bool,
-                conj_lhs: bool,
-                conj_rhs: bool,
-                parallelism: Parallelism,
-            ) {
-                use microkernel::$name::f32::{H_M, H_N, H_UKR, MR_DIV_N, NR, UKR};
-                let simd = <$simd>::try_new().expect("the processor has the instructions of the chosen kernel");
-                // SAFETY: the caller vouches for the matrices, and `try_new` for the instructions.
-                unsafe {
-                    gemm_basic_generic::<_, f32, $lanes, { MR_DIV_N * $lanes }, NR, MR_DIV_N, H_M, H_N>(
-                        simd,
-                        m,
-                        n,
-                        k,
-                        dst,
-                        dst_cs,
-                        dst_rs,
-                        read_dst,
-                        lhs,
-                        lhs_cs,
-                        lhs_rs,
-                        rhs,
-                        rhs_cs,
-                        rhs_rs,
-                        alpha,
-                        beta,
-                        conj_dst,
-                        conj_lhs,
-                        conj_rhs,
-                        |a, b, c| a * b + c,
-                        &UKR,
-                        &H_UKR,
-                        false,
-                        parallelism,
-                    );
-                }
-            }
-        };
-    }
-    kernel!(fma, V3, 8);
-    kernel!(avx512f, V4, 16);
-
-    /// Returns the kernel of the widest vectors that a product may be computed with.
-    pub fn kernel(has_sums_over_lanes: bool) -> Kernel<f32> {
-        match (V3::try_new(), V4::try_new()) {
-            (_, Some(_)) if !has_sums_over_lanes => avx512f,
-            (Some(_), _) => fma,
-            _ => gemm_f32::gemm::f32::get_gemm_fn(),
-        }
-    }
-}
-
-/// The kernels of single precision of other processors.
-#[cfg(not(any(target_arch = "x86", target_arch = "x86_64")))]
-mod single {
-    /// Returns the kernel of the processor.
-    pub fn kernel(_has_sums_over_lanes: bool) -> super::Kernel<f32> {
-        gemm_f32::gemm::f32::get_gemm_fn()
-    }
-}
-
-/// Computes a product block by block. `alpha` is the factor of the destination, none if it is not read; `one` is 1.
+/// Computes a product with a kernel of another crate. `zero` is any factor of a destination that is not read.
 ///
 /// # Safety
 /// As for [`gemm()`].
-unsafe fn in_blocks<T: Copy>(
-    kernel: impl Fn(&Product<T>) -> Kernel<T>,
-    product: Product<T>,
-    (alpha, beta, one): (Option<T>, T, T),
+unsafe fn call<T: Copy>(
+    kernel: Kernel<T>,
+    product: &Product<T>,
+    (alpha, beta): Factors<T>,
+    zero: T,
     parallelism: Parallelism,
 ) {
-    let product = product.oriented();
-    let (kernel, block) = (kernel(&product), product.block());
     let Product { sides: [m, n, k], dst, lhs, rhs } = product;
-    let (mut done, mut factor) = (0, alpha);
+    // SAFETY: as for this function.
+    unsafe {
+        kernel(
+            *m,
+            *n,
+            *k,
+            dst.first,
+            dst.to_next_column,
+            dst.to_next_row,
+            alpha.is_some(),
+            lhs.first,
+            lhs.to_next_column,
+            lhs.to_next_row,
+            rhs.first,
+            rhs.to_next_column,
+            rhs.to_next_row,
+            alpha.unwrap_or(zero),
+            beta,
+            false,
+            false,
+            false,
+            parallelism,
+        );
+    }
+}
+
+/// Single precision on other processors.
+#[cfg(not(target_arch = "x86_64"))]
+mod single {
+    use crate::{Factors, Parallelism, Product, call};
+
+    /// Computes a product.
+    ///
+    /// # Safety
+    /// As for [`gemm()`](crate::gemm()).
+    pub unsafe fn multiply(product: &Product<f32>, factors: Factors<f32>, parallelism: Parallelism) {
+        // SAFETY: as for this function.
+        unsafe { call(gemm_f32::gemm::f32::get_gemm_fn(), product, factors, 0.0, parallelism) };
+    }
+}
+
+/// Computes a product block by block. `multiply` computes a block, of which it vouches that all elements are valid; `one` is 1.
+fn in_blocks<T: Copy>(
+    multiply: impl Fn(&Product<T>, Factors<T>),
+    product: Product<T>,
+    (mut alpha, beta): Factors<T>,
+    one: T,
+) {
+    let product = product.oriented();
+    let block = product.block();
+    let Product { sides: [m, n, k], dst, lhs, rhs } = product;
+    let mut done = 0;
     loop {
         let length = block.min(k - done);
-        let lhs_first = lhs.first.wrapping_offset(done as isize * lhs.to_next_column);
-        let rhs_first = rhs.first.wrapping_offset(done as isize * rhs.to_next_row);
-        // SAFETY: the block consists of elements of the matrices, which the caller vouches for.
-        unsafe {
-            kernel(
-                m,
-                n,
-                length,
-                dst.first,
-                dst.to_next_column,
-                dst.to_next_row,
-                factor.is_some(),
-                lhs_first,
-                lhs.to_next_column,
-                lhs.to_next_row,
-                rhs_first,
-                rhs.to_next_column,
-                rhs.to_next_row,
-                factor.unwrap_or(one),
-                beta,
-                false,
-                false,
-                false,
-                parallelism,
-            );
-        }
+        let block = Product { sides: [m, n, length], dst, lhs: lhs.at(0, done), rhs: rhs.at(done, 0) };
+        multiply(&block, (alpha, beta));
         done += length;
         // The destination holds the sum of the blocks so far.
-        factor = Some(one);
+        alpha = Some(one);
         if done == k {
             return;
         }
@@ -298,20 +270,23 @@ pub unsafe fn gemm<T: 'static>(
         lhs: Matrix::new(lhs, lhs_cs, lhs_rs),
         rhs: Matrix::new(rhs, rhs_cs, rhs_rs),
     };
-    let (alpha, beta) = (&raw const alpha, &raw const beta);
+    let factors = (read_dst.then_some(alpha), beta);
+    let factors = &raw const factors;
     // SAFETY: `T` is the type that is compared; otherwise as for this function.
     unsafe {
         if TypeId::of::<T>() == TypeId::of::<f32>() {
-            let factors = (read_dst.then_some(*alpha.cast()), *beta.cast(), 1.0);
-            let kernel = |product: &Product<f32>| single::kernel(product.has_sums_over_lanes());
-            in_blocks(kernel, product.cast(), factors, parallelism);
+            let multiply = |product: &_, factors| single::multiply(product, factors, parallelism);
+            in_blocks(multiply, product.cast(), factors.cast::<Factors<f32>>().read(), 1.0);
         } else if TypeId::of::<T>() == TypeId::of::<f64>() {
-            let factors = (read_dst.then_some(*alpha.cast()), *beta.cast(), 1.0);
-            in_blocks(|_| gemm_f64::gemm::f64::get_gemm_fn(), product.cast(), factors, parallelism);
+            let kernel = gemm_f64::gemm::f64::get_gemm_fn();
+            let multiply = |product: &_, factors| call(kernel, product, factors, 0.0, parallelism);
+            in_blocks(multiply, product.cast(), factors.cast::<Factors<f64>>().read(), 1.0);
         } else {
             assert!(TypeId::of::<T>() == TypeId::of::<gemm_f16::f16>(), "products of this type are not computed here");
-            let factors = (read_dst.then_some(*alpha.cast()), *beta.cast(), gemm_f16::f16::ONE);
-            in_blocks(|_| gemm_f16::gemm::f16::get_gemm_fn(), product.cast(), factors, parallelism);
+            let (kernel, zero) = (gemm_f16::gemm::f16::get_gemm_fn(), gemm_f16::f16::ZERO);
+            let multiply = |product: &_, factors| call(kernel, product, factors, zero, parallelism);
+            let factors = factors.cast::<Factors<gemm_f16::f16>>().read();
+            in_blocks(multiply, product.cast(), factors, gemm_f16::f16::ONE);
         }
     }
 }
@@ -394,52 +369,127 @@ mod tests {
         }
     }
 
-    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+    #[cfg(target_arch = "x86_64")]
     fn has_fma() -> bool {
         std::arch::is_x86_feature_detected!("fma") && std::arch::is_x86_feature_detected!("avx2")
     }
 
-    #[cfg(not(any(target_arch = "x86", target_arch = "x86_64")))]
+    #[cfg(not(target_arch = "x86_64"))]
     fn has_fma() -> bool {
         false
     }
 
-    /// Products of every orientation, with small and large sides and with long sums, that are added to what is there.
-    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+    /// The distances between neighbours of a matrix, how many elements they span, and the index of the first.
+    #[cfg(target_arch = "x86_64")]
+    struct Layout {
+        to_next_column: isize,
+        to_next_row: isize,
+        length: usize,
+        first: usize,
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    impl Layout {
+        fn new(rows: usize, columns: usize, [to_next_column, to_next_row]: [isize; 2]) -> Self {
+            let spans = [(columns, to_next_column), (rows, to_next_row)].map(|(n, step)| (n as isize - 1) * step);
+            let before: isize = spans.iter().map(|span| span.min(&0)).sum();
+            let after: isize = spans.iter().map(|span| span.max(&0)).sum();
+            Self { to_next_column, to_next_row, length: (after - before + 1) as usize, first: (-before) as usize }
+        }
+    }
+
+    /// All ways to compute a product whose matrices have these layouts give the bits of a kernel without tiles, and write no other
+    /// element.
+    #[cfg(target_arch = "x86_64")]
+    fn check_ways(sides: [usize; 3], [dst, lhs, rhs]: [&Layout; 3], alpha: Option<f32>) {
+        type Way<'a> = (&'a str, &'a dyn Fn(&Product<f32>, Factors<f32>));
+        // The elements before and behind the destination.
+        const EDGE: usize = 32;
+        let (left, right) = (values(lhs.length, 1), values(rhs.length, 5));
+        // SAFETY: the layouts are those of the memory, and the processor has the instructions.
+        let ways: [Way<'_>; 5] = unsafe {
+            [
+                ("kernel", &|product, factors| call(single::fma::kernel, product, factors, 0.0, Parallelism::None)),
+                ("AVX2", &|product, factors| single::fma::multiply(product, factors, Parallelism::None)),
+                ("widest", &|product, factors| single::multiply(product, factors, Parallelism::None)),
+                #[cfg(feature = "rayon")]
+                ("three threads", &|product, factors| single::multiply(product, factors, Parallelism::Rayon(3))),
+                #[cfg(feature = "rayon")]
+                ("many threads", &|product, factors| single::multiply(product, factors, Parallelism::Rayon(40))),
+            ]
+        };
+        let outs = ways.map(|(name, way)| {
+            let mut out = values(dst.length + 2 * EDGE, 3);
+            let product = Product {
+                sides,
+                dst: Matrix::new(out[EDGE + dst.first..].as_mut_ptr(), dst.to_next_column, dst.to_next_row),
+                lhs: Matrix::new(left[lhs.first..].as_ptr(), lhs.to_next_column, lhs.to_next_row),
+                rhs: Matrix::new(right[rhs.first..].as_ptr(), rhs.to_next_column, rhs.to_next_row),
+            };
+            in_blocks(way, product, (alpha, 2.0), 1.0);
+            (name, out.into_iter().map(f32::to_bits).collect::<Vec<_>>())
+        });
+        for (name, out) in &outs[1..] {
+            let steps = [dst, lhs, rhs].map(|layout| [layout.to_next_column, layout.to_next_row]);
+            assert!(*out == outs[0].1, "{sides:?}, {steps:?}, {alpha:?}: {name}");
+        }
+    }
+
+    /// Products of every orientation, with small and large sides and with long sums.
+    #[cfg(target_arch = "x86_64")]
     #[test]
-    fn vectors_of_both_widths_give_the_same_bits() {
-        if !(has_fma() && std::arch::is_x86_feature_detected!("avx512f")) {
+    fn vectors_of_both_widths_tiles_and_threads_give_the_bits_of_the_kernels() {
+        if !has_fma() {
             return;
         }
-        for m in [1, 7, 16, 33, 64, 130] {
-            for n in [1, 5, 6, 17, 65] {
-                for k in [1, 2, 3, 24, 129, 700] {
-                    for layouts in 0..8 {
-                        let (lhs, rhs) = (values(m * k, 1), values(k * n, 5));
-                        let [with_avx512, with_avx2] = [None, Some(single::fma as Kernel<f32>)].map(|kernel| {
-                            let mut out = values(m * n, 3);
-                            // The strides to the next column and row: row-major or column-major.
-                            let strides = |bit: usize, rows: usize, columns: usize| {
-                                if layouts >> bit & 1 == 0 { (1, columns as isize) } else { (rows as isize, 1) }
-                            };
-                            let [dst, l, r] = [strides(0, m, n), strides(1, m, k), strides(2, k, n)];
-                            let product = Product {
-                                sides: [m, n, k],
-                                dst: Matrix::new(out.as_mut_ptr(), dst.0, dst.1),
-                                lhs: Matrix::new(lhs.as_ptr(), l.0, l.1),
-                                rhs: Matrix::new(rhs.as_ptr(), r.0, r.1),
-                            };
-                            let choose = |product: &Product<f32>| {
-                                kernel.unwrap_or_else(|| single::kernel(product.has_sums_over_lanes()))
-                            };
-                            // SAFETY: the matrices have the stated sizes.
-                            unsafe { in_blocks(choose, product, (Some(0.5), 2.0, 1.0), Parallelism::None) };
-                            out
-                        });
-                        assert!(with_avx512 == with_avx2, "{m} x {k} x {n}, layouts {layouts}");
-                    }
-                }
+        let small =
+            [1, 7, 16, 33, 64, 130].map(|m| [1, 5, 6, 17, 65].map(|n| [1, 2, 3, 24, 129, 700].map(|k| [m, n, k])));
+        // More panels than are laid out at once, and rows of the right matrix that lie a multiple of 4 KiB apart.
+        for sides in small.into_iter().flatten().flatten().chain([[330, 1024, 500]]) {
+            let [m, n, k] = sides;
+            for layouts in 0..8 {
+                let layout = |bit: usize, rows: usize, columns: usize| {
+                    let row_major = layouts >> bit & 1 == 0;
+                    Layout::new(rows, columns, if row_major { [1, columns as isize] } else { [rows as isize, 1] })
+                };
+                let [dst, lhs, rhs] = [layout(0, m, n), layout(1, m, k), layout(2, k, n)];
+                let alphas = if m > 200 { &[None][..] } else { &[None, Some(1.0), Some(0.5)] };
+                alphas.iter().for_each(|alpha| check_ways(sides, [&dst, &lhs, &rhs], *alpha));
             }
+        }
+    }
+
+    /// Products of parts of matrices, and of rows and columns that repeat or run backwards.
+    #[cfg(target_arch = "x86_64")]
+    #[test]
+    fn matrices_may_have_any_layout() {
+        if !has_fma() {
+            return;
+        }
+        let mut state = 1_u64;
+        let mut draw = |below: usize| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as usize % below
+        };
+        for case in 0..600 {
+            let [m, n, k] = [2 + draw(200), 2 + draw(200), 1 + draw(560)];
+            let mut layout = |rows: usize, columns: usize, is_read: bool| {
+                let padding = [0, 1, 7][draw(3)];
+                let [to_next_column, to_next_row] = match draw(if is_read { 6 } else { 4 }) {
+                    0 => [1, columns + padding],
+                    1 => [rows + padding, 1],
+                    2 => [1, 1024.max(columns)],
+                    3 => [2, 2 * columns + padding],
+                    4 => [1, 0],
+                    _ => [0, 1],
+                }
+                .map(|step| step as isize);
+                let backwards = draw(6);
+                let sign = |of: usize| if backwards == of { -1 } else { 1 };
+                Layout::new(rows, columns, [sign(0) * to_next_column, sign(1) * to_next_row])
+            };
+            let [dst, lhs, rhs] = [layout(m, n, false), layout(m, k, true), layout(k, n, true)];
+            check_ways([m, n, k], [&dst, &lhs, &rhs], [None, Some(1.0), Some(0.5), Some(0.0)][case % 4]);
         }
     }
 

@@ -3,7 +3,7 @@
 use gemm::{Parallelism, gemm};
 
 /// The number of multiplications from which a product is computed by several threads.
-const PARALLEL: usize = 1 << 23;
+const PARALLEL: usize = 1 << 22;
 
 /// A row-major matrix, or its transpose.
 #[derive(Clone, Copy, Debug)]

@@ -154,12 +154,16 @@ pub fn blend<M: Module>(average: M, module: &M, keep: f64) -> M {
     })
 }
 
-/// Adds two tensors with weights, in one pass.
+/// Adds two tensors with weights, in one pass, in parts that threads compute in parallel.
 fn blend_on_host(old: Tensor<1>, new: &Tensor<1>, weights: [f32; 2]) -> Tensor<1> {
+    /// The elements of a part.
+    const PART: usize = 1 << 16;
     let device = old.device();
     let mut values = host(old);
     let new = HostValues::of(new);
-    values.iter_mut().zip(&*new).for_each(|(old, new)| *old = *old * weights[0] + new * weights[1]);
+    values.par_chunks_mut(PART).zip(new.par_chunks(PART)).for_each(|(old, new)| {
+        old.iter_mut().zip(new).for_each(|(old, new)| *old = *old * weights[0] + new * weights[1]);
+    });
     let shape = [values.len()];
     Tensor::from_data(TensorData::new(values, shape), &device)
 }

@@ -132,6 +132,7 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
         scale,
         gradients: Named::new(),
     };
+    let mut gradients = vec![];
     for ((shard, world_model), policy) in shards.iter().zip(world_models).zip(policies) {
         let fraction = shard.clips as f64 / clips as f64;
         let [consistency, reward, value, termination] = world_model.losses.map(|loss| loss * fraction);
@@ -142,15 +143,12 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
         step.policy += policy.loss * fraction;
         step.q += policy.q * fraction;
         step.entropy += policy.entropy * fraction;
-        for (name, gradient) in world_model.gradients.into_iter().chain(policy.gradients) {
-            let gradient = gradient * fraction;
-            let sum = match step.gradients.remove(&name) {
-                Some(sum) => sum + gradient,
-                None => gradient,
-            };
-            step.gradients.insert(name, sum);
-        }
+        gradients.extend([(world_model.gradients, fraction), (policy.gradients, fraction)]);
     }
+    let scaled = |(gradients, fraction): (Named<Tensor<1>>, f64)| -> Named<Tensor<1>> {
+        gradients.into_iter().map(|(name, gradient)| (name, gradient * fraction)).collect()
+    };
+    parameters::add_all(&mut step.gradients, gradients.into_par_iter().map(scaled).collect());
     debug_assert_eq!(horizon, draws.target_critics.len());
     step.total = config.consistency * step.consistency
         + config.reward * step.reward

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import json
-import threading
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from . import _engine
+from ._forks import fork_lock
 from .wrapper.visual import VisualWrapper, engine_wrappers
 
+
+def _forget_bridge() -> None:
+    """Makes a forked process load the modules again that another thread was loading: their code has run in part."""
+    for name, last in (("swm_bridge", "make"), ("swm_craftax", "Craftax")):
+        if not hasattr(sys.modules.get(name), last):
+            sys.modules.pop(name, None)
+
+
 #: Only one thread loads the module of the bridge: Python lists a module before its code has run.
-_LOADING = threading.RLock()
+_LOADING = fork_lock(_forget_bridge)
 
 
 def open_world(

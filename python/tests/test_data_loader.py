@@ -148,6 +148,10 @@ def test_goals_are_later_rows_of_the_episode(stored):
         assert set(batch["end_reward"].ravel()) <= lasts
     with pytest.raises(ValueError, match="add up to 1"):
         loader(path, goals=data.Goals(random=1.0))
+    for name in ("random", "discount"):
+        for value in (float("nan"), float("inf"), -0.5, "often", None):
+            with pytest.raises(ValueError, match=rf"Goals.{name}: .*; expected a finite number of at least 0"):
+                loader(path, goals=data.Goals(columns=["reward"], **{name: value}))
 
 
 def test_transform_is_applied_before_frameskip_joins_actions(stored):

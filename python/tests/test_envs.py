@@ -107,6 +107,29 @@ def test_reset_options_choose_factors_and_the_initial_state():
         env.reset(options={"variation": ["agent.colour"]})
 
 
+def test_variation_space_that_a_program_holds_has_the_values_of_the_current_episode():
+    env = gymnasium.make("swm/TwoRoom-v1", image_shape=(32, 32)).unwrapped
+    color = env.variation_space["agent"]["color"]
+    seen, snapshots, rows = [], [], []
+    for seed in (1, 2):
+        _, info = env.reset(seed=seed, options={"variation": ["agent.color"]})
+        seen.append(color.value.tolist())
+        assert seen[-1] == list(env._env.factors()["agent.color"])
+        snapshots.append(env.snapshot())
+        rows.append({"state": info["state"], "variation_agent_color": color.value.astype(np.float32)})
+    assert seen[0] != seen[1]
+    env.restore(snapshots[0])
+    assert color.value.tolist() == seen[0]
+    env.restore_from(rows[1], rows[1])
+    assert color.value.tolist() == seen[1]
+    # The values that a program sets stay until the next episode.
+    color.set_value(np.array([1, 2, 3], np.uint8))
+    env.step(env.action_space.sample())
+    assert env.variation_space["agent"]["color"].value.tolist() == [1, 2, 3]
+    env.reset(seed=1, options={"variation": ["agent.color"]})
+    assert color.value.tolist() == seen[0]
+
+
 def test_unknown_keyword_arguments_and_render_modes_raise():
     with pytest.raises(ValueError, match="no_such_option"):
         gymnasium.make("swm/PushT-v1", no_such_option=3)

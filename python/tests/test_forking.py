@@ -110,6 +110,121 @@ print(json.dumps([said, status, data.load_dataset({str(tmp_path / name)!r}).num_
     assert episodes == 2
 
 
+#: Holds `lock` in another thread while the process forks. The child process ends if it waits for the lock.
+HOLDING = """
+import json, os, signal, sys, threading
+import numpy as np
+from stable_worldmodel import World, _gym, data
+from stable_worldmodel._forks import fork_lock
+from stable_worldmodel.data.foreign import _Rows
+rows = {{"state": np.zeros((3, 2), np.float32), "action": np.zeros((2, 1), np.float32)}}
+{prepare}
+held, done = threading.Event(), threading.Event()
+def hold():
+    with lock:
+        held.set()
+        done.wait()
+thread = threading.Thread(target=hold)
+thread.start()
+held.wait()
+{fork}
+done.set()
+thread.join()
+{after}
+print(json.dumps([said, status]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("prepare", "work", "after"),
+    [
+        ("lock = fork_lock()", "lock.acquire()", "lock.acquire()"),
+        (
+            "buffer = data.ReplayBuffer(100); buffer.write_episode(rows); lock = buffer._lock",
+            "buffer.sample(2); buffer.write_episode(rows); assert buffer.num_episodes == 2",
+            "buffer.sample(2); assert buffer.num_episodes == 1",
+        ),
+        (
+            "buffer = data.ReplayBuffer(100); buffer.write_episode(rows); reader = _Rows(buffer); lock = reader._lock",
+            "assert reader.rows('state', 0, 0, 3).shape == (3, 2)",
+            "assert reader.rows('state', 0, 0, 3).shape == (3, 2)",
+        ),
+        # Python lists a module whose code runs in the other thread.
+        (
+            "import counting, types; lock = _gym._LOADING; sys.modules['swm_bridge'] = types.ModuleType('swm_bridge')",
+            "World('Counting-v0', num_envs=1).reset(seed=0)",
+            "assert not vars(sys.modules['swm_bridge']).get('Bridge')",
+        ),
+    ],
+    ids=["lock", "buffer", "reader", "bridge"],
+)
+def test_forked_processes_can_take_the_locks_that_another_thread_held(tmp_path, prepare, work, after):
+    text = HOLDING.format(prepare=prepare, fork=in_fork(f"signal.alarm(30); {work}"), after=after)
+    assert run(tmp_path, text) == ["no error", 0]
+
+
+def test_forked_processes_cannot_use_a_writer_with_which_another_thread_wrote(tmp_path):
+    prepare = "writer = data.EpisodeWriter('d.lance'); writer.write_episode(rows); lock = writer._lock"
+    after = "writer.write_episode(rows); writer.close(); assert data.load_dataset('d.lance').num_episodes == 2"
+    for work in ("writer.write_episode(rows)", "writer.close()"):
+        text = HOLDING.format(prepare=prepare, fork=in_fork(f"signal.alarm(30); {work}"), after=after)
+        (tmp_path / work[:12]).mkdir()
+        said, status = run(tmp_path / work[:12], text)
+        assert status == 0 and "before this process was forked" in said, said
+
+
+def test_thread_that_forks_keeps_its_lock(tmp_path):
+    text = f"""
+import threading
+from stable_worldmodel._forks import fork_lock
+lock = fork_lock()
+def is_free():
+    found = []
+    thread = threading.Thread(target=lambda: found.append(lock.acquire(blocking=False)))
+    thread.start()
+    thread.join()
+    return found[0]
+def check():
+    if is_free():
+        raise ValueError("the lock is free")
+    lock.release()
+    if not is_free():
+        raise ValueError("the lock is not free")
+lock.acquire()
+{in_fork("check()")}
+print(json.dumps([said, status]))
+"""
+    assert run(tmp_path, text) == ["no error", 0]
+
+
+def test_forked_process_plays_while_another_thread_of_its_parent_is_in_a_step(tmp_path):
+    text = f"""
+import signal, threading
+import counting
+from stable_worldmodel import World, policy
+def play(name):
+    world = World(name, num_envs=1)
+    world.set_policy(policy.RandomPolicy())
+    world.reset(seed=0)
+    world.step()
+class Waiting:
+    def step(self):
+        begun.set()
+        done.wait()
+begun, done = threading.Event(), threading.Event()
+counting.Nested.inner = Waiting()
+thread = threading.Thread(target=play, args=["Nested-v0"])
+thread.start()
+begun.wait()
+{in_fork("signal.alarm(30); play('Counting-v0')")}
+done.set()
+thread.join()
+play("Counting-v0")
+print(json.dumps([said, status]))
+"""
+    assert run(tmp_path, text) == ["no error", 0]
+
+
 @pytest.mark.parametrize("end", ["lance", "h5", "folder", "video", "lerobot"])
 def test_new_writers_work_in_a_forked_process(tmp_path, end):
     text = f"""
@@ -182,10 +297,17 @@ def test_columns_with_the_names_of_numbers_are_not_left_out_silently(tmp_path):
     rows = {"state": np.zeros((3, 2), np.float32), "action": np.zeros((2, 1), np.float32)}
     with data.open_writer(tmp_path / "d.lance") as writer:
         writer.write_episode({**rows, "step_idx": np.array([7, 8, 9]), "episode_idx": [4, 4, 4]})
-        for name, values in (("step_idx", [0, 5, 10]), ("episode_idx", [0, 1, 2]), ("step_idx", ["a", "b", "c"])):
+        writer.write_episode({**rows, "episode_idx": np.full((3, 1), 4), "step_idx": np.array([[7], [8], [9]])})
+        for name, values in (
+            ("step_idx", [0, 5, 10]),
+            ("step_idx", [[0, 1], [2, 3], [4, 5]]),
+            ("step_idx", ["a", "b", "c"]),
+            ("episode_idx", [0, 1, 2]),
+            ("episode_idx", np.full((3, 2), 4)),
+        ):
             with pytest.raises(ValueError, match=f"column '{name}': its values would be lost"):
                 writer.write_episode({**rows, name: values})
-    assert data.load_dataset(tmp_path / "d.lance").num_episodes == 1
+    assert data.load_dataset(tmp_path / "d.lance").num_episodes == 2
 
 
 def test_wrong_starts_and_factors_have_clear_errors(tmp_path):
@@ -206,6 +328,11 @@ def test_wrong_starts_and_factors_have_clear_errors(tmp_path):
     ):
         with pytest.raises((ValueError, IndexError), match=words):
             world.evaluate(dataset=tmp_path / "d.lance", episodes_idx=episodes, start_steps=steps)
+    given = {"dataset": tmp_path / "d.lance", "episodes_idx": [0], "start_steps": [1], "goal_offset": 1, "eval_budget": 1}
+    with pytest.raises(ValueError, match="episodes: 3; expected 1, the length of episodes_idx"):
+        world.evaluate(episodes=3, **given)
+    for episodes in (None, 1):
+        assert len(world.evaluate(episodes=episodes, floor=False, progress=False, **given)["steps"]) == 1
     for value in (float("nan"), [0.5, float("inf")], "red"):
         with pytest.raises(ValueError, match=r"options\['variation_values'\]\['agent.speed'\]: expected"):
             world.reset(seed=0, options={"variation_values": {"agent.speed": value}})

@@ -35,6 +35,26 @@ def test_published_checkpoints_compute_the_recorded_outputs(family):
         assert (actual - expected).abs().max() < 1e-5 * expected.abs().max()
 
 
+def test_weights_with_two_names_and_complex_weights_are_refused(tmp_path):
+    source = GOLDEN / "reference" / "lewm"
+    weights = torch.load(source / "weights.pt", weights_only=True)
+    newer = "encoder.layers.0.attention.q_proj.weight"
+    older = _weights.published(newer)
+    value = weights.pop(newer) if newer in weights else weights.pop(older)
+    (tmp_path / "config.json").write_bytes((source / "config.json").read_bytes())
+
+    def load(changed):
+        torch.save({**weights, **changed}, tmp_path / "weights.pt")
+        return load_pretrained(tmp_path / "weights.pt").state_dict()[older]
+
+    for name in (older, newer):
+        assert torch.equal(load({name: value}), value)
+    with pytest.raises(RuntimeError, match=f"'{older}' and '{newer}' are two names of one weight"):
+        load({older: value, newer: 2 * value})
+    with pytest.raises(RuntimeError, match=f"the weight '{newer}' is torch.complex64; expected real numbers"):
+        load({newer: torch.complex(value, value)})
+
+
 def lewm_config():
     module = "stable_worldmodel.wm.lewm.module"
     norm = {"_target_": "torch.nn.BatchNorm1d", "_partial_": True}

@@ -530,6 +530,24 @@ def test_a_loss_that_is_not_finite_ends_the_training(rooms, tmp_path):
     assert np.isfinite(swm.wm.load(str(tmp_path / "run")).card["action_std"]).all()
 
 
+@pytest.mark.parametrize("training", [engine_train, torch_train])
+def test_a_validation_loss_that_is_not_finite_ends_the_training(training, tmp_path):
+    rng = np.random.default_rng(0)
+    held_out, path = (4, 6, 16, 23, 24, 32), str(tmp_path / "nan.lance")
+    with swm.data.open_writer(path) as writer:
+        for episode in range(40):
+            state = rng.normal(size=(20, 4)).astype(np.float32)
+            state[5] += np.nan if episode in held_out else 0.0
+            action = rng.normal(size=(19, 2)).astype(np.float32)
+            writer.write_episode({"state": state, "action": action, "reward": np.zeros(20), "terminated": np.zeros(20, bool)})
+    settings = ["schedule.steps=4", "data.batch_size=32", "data.hold_out=true", "validation.every=2", "validation.batches=1"]
+    with pytest.raises(
+        (FloatingPointError, ValueError), match="validation loss.*not finite after step 2|after step 2 is not finite"
+    ):
+        training("tdmpc2", path, tmp_path / "run", settings)
+    assert not (tmp_path / "run/best").exists() and weights(tmp_path / "run"), "the weights are kept"
+
+
 def test_a_class_of_another_family_is_refused_before_anything_is_written(rooms, tmp_path):
     with pytest.raises(TypeError, match="'gcbc' is a GCRL, not a LeWM; derive the class from GCRL"):
         torch_train("gcbc", rooms, tmp_path / "run", SHORT, kind=swm.wm.LeWM)

@@ -94,15 +94,25 @@ impl Space {
         }
     }
 
-    /// Draws a value uniformly.
+    /// Draws a value uniformly within finite bounds. An element with one finite bound is exponentially distributed from that bound on, and one without
+    /// normally, both with scale 1, as in Gymnasium.
     pub fn sample(&self, rng: &mut Rng) -> Vec<f64> {
         (0..self.len())
             .map(|i| {
                 let (low, high) = self.bounds(i);
-                match self.dtype() {
-                    DType::Float32 | DType::Float64 => self.round(low + (high - low) * rng.random::<f64>()),
-                    _ => rng.random_range(low as i64..=high as i64) as f64,
+                if !matches!(self.dtype(), DType::Float32 | DType::Float64) {
+                    return rng.random_range(low as i64..=high as i64) as f64;
                 }
+                let share = rng.random::<f64>();
+                // The logarithm of a number above 0.
+                let distance = || -(1.0 - share).ln();
+                self.round(match (low.is_finite(), high.is_finite()) {
+                    (true, true) => low + (high - low) * share,
+                    (true, false) => low + distance(),
+                    (false, true) => high - distance(),
+                    // Box and Muller, "A note on the generation of random normal deviates", 1958.
+                    (false, false) => (2.0 * distance()).sqrt() * (std::f64::consts::TAU * rng.random::<f64>()).cos(),
+                })
             })
             .collect()
     }
@@ -173,6 +183,18 @@ mod tests {
     use crate::Key;
 
     #[test]
+    fn samples_without_bounds_have_the_moments_of_their_distributions() {
+        let (infinite, mut rng) = (f64::INFINITY, Key::new(2).rng());
+        for (low, high, mean) in [(5.0, infinite, 6.0), (-infinite, -5.0, -6.0), (-infinite, infinite, 0.0)] {
+            let space = Space::uniform_box([1], DType::Float64, low, high);
+            let values: Vec<f64> = (0..20_000).flat_map(|_| space.sample(&mut rng)).collect();
+            let found = values.iter().sum::<f64>() / values.len() as f64;
+            let variance = values.iter().map(|value| (value - found).powi(2)).sum::<f64>() / values.len() as f64;
+            assert!((found - mean).abs() < 0.04 && (variance - 1.0).abs() < 0.1, "{low}, {high}: {found}, {variance}");
+        }
+    }
+
+    #[test]
     fn samples_are_inside_the_space_and_other_values_are_errors() {
         let spaces = [
             Space::uniform_box([2], DType::Float32, -1.0, 1.0),
@@ -180,6 +202,9 @@ mod tests {
             Space::Discrete { n: 3, start: 1 },
             Space::MultiDiscrete { nvec: vec![224, 21], start: vec![0, 1] },
             Space::Rgb,
+            Space::uniform_box([2], DType::Float32, 5.0, f64::INFINITY),
+            Space::uniform_box([2], DType::Float32, f64::NEG_INFINITY, -5.0),
+            Space::uniform_box([2], DType::Float64, f64::NEG_INFINITY, f64::INFINITY),
         ];
         let mut rng = Key::new(1).rng();
         for space in &spaces {

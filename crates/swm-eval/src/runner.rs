@@ -127,7 +127,7 @@ impl EvalRequest {
     /// Evaluates every policy, and the random-policy floor, from the same starts under every condition.
     ///
     /// Each policy and condition is a stage `evaluate` with the subject `[policy, condition]`; its metrics are
-    /// `success_rate`, `successes` and `episodes` (the number of episodes that count).
+    /// `success_rate` with its interval, `success_low` and `success_high`, `successes` and `episodes` (the number of episodes that count).
     ///
     /// # Errors
     /// When the request is invalid or names an unknown environment, dataset, policy or factor, a policy or an
@@ -389,9 +389,16 @@ fn joined(earlier: &Run, later: Run, counting: Counting) -> Run {
 }
 
 /// The summary of a run, for [`Event::Finished`].
-fn metrics(run: &Run) -> [(&'static str, f64); 3] {
-    let success = &run.success;
-    [("success_rate", success.rate), ("successes", success.successes as f64), ("episodes", success.n as f64)]
+fn metrics(run: &Run) -> [(&'static str, f64); 5] {
+    let Proportion { successes, n, rate, low, high, .. } = run.success;
+    let counts = [successes, n].map(|count| count as f64);
+    [
+        ("success_rate", rate),
+        ("success_low", low),
+        ("success_high", high),
+        ("successes", counts[0]),
+        ("episodes", counts[1]),
+    ]
 }
 
 /// The names of a policy and of a condition as the name of a file. It has a part of their hash where other names could give the same words.

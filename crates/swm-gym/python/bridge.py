@@ -36,6 +36,16 @@ from gymnasium import spaces
 ALIGN = 64
 # Environments of one process run one at a time: frames of pygame, for example, differ in some pixels when two threads draw.
 RUNNING = threading.RLock()
+
+
+def free_running():
+    """Frees the lock in a forked process, which lacks the thread that held it. A thread that forks inside a call keeps it."""
+    if not RUNNING._is_owned():
+        RUNNING._at_fork_reinit()
+
+
+if hasattr(os, 'register_at_fork'):
+    os.register_at_fork(after_in_child=free_running)
 # The header of the buffer: reward, goal distance; terminated, truncated, success.
 HEAD = struct.Struct('<dd???')
 # The index of the flag that a forked process sets, behind the header.
@@ -164,9 +174,7 @@ class Actions:
             with np.errstate(over='ignore'):
                 sides = ('low', 'high')
                 low, high = np.float32([np.concatenate([getattr(p, s).reshape(-1) for p in parts]) for s in sides])
-            # Random actions need finite bounds, so infinite bounds become -1 and 1. Actions are not clipped.
-            low = np.where(np.isfinite(low), low, -1)
-            high = np.where(np.isfinite(high), high, 1)
+            # Actions are not clipped.
             shape = parts[0].shape if len(parts) == 1 else low.shape
             self.json = box(low, np.maximum(low, high), shape, np.float32)
         else:

@@ -88,12 +88,15 @@ def _from_torch(tensor: Any) -> Array:
 def _check_numbering(name: str, value: Any) -> None:
     """Refuses a column that has a name of `NUMBERING` and holds something else."""
     try:
-        numbers = np.asarray(to_numpy(value), dtype=np.float64).reshape(-1)
-        fits = bool(np.all(numbers == np.round(numbers)) and np.all(np.diff(numbers) == (1 if name == "step_idx" else 0)))
+        numbers = np.asarray(to_numpy(value), dtype=np.float64)
+        # Some sources store scalar columns as lists of one element.
+        scalar = numbers.ndim == 0 or numbers.size == len(numbers)
+        integers = np.all(numbers == np.round(numbers))
+        fits = bool(scalar and integers and np.all(np.diff(numbers.reshape(-1)) == (1 if name == "step_idx" else 0)))
     except (TypeError, ValueError):
         fits = False
     if not fits:
-        expected = "the numbers of consecutive steps" if name == "step_idx" else "one number"
+        expected = "the numbers of consecutive steps" if name == "step_idx" else "one number, the same for each step"
         raise ValueError(
             f"column {name!r}: its values would be lost, because datasets number episodes and steps themselves;"
             f" rename the column, or give {expected}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from stable_worldmodel import _engine, _options
+from stable_worldmodel._forks import fork_lock
 
 from . import _tensors
 from ._tensors import NUMBERING, Array
@@ -151,7 +151,7 @@ class ReplayBuffer(Dataset):
         self._buffer: Any = None
         self._columns: list[tuple[str, str, list[int]]] = []
         #: Held while the content changes, and while a sampler of the user, which may call the buffer, chooses from it.
-        self._lock = threading.RLock()
+        self._lock = fork_lock()
         #: The latest samplers of the engine's buffer, by batch size and history length. Each keeps memory for its batches.
         self._samplers: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._step = 0
@@ -165,7 +165,7 @@ class ReplayBuffer(Dataset):
     def __setstate__(self, state: dict[str, Any]) -> None:
         episodes = state.pop("_episodes")
         self.__dict__.update(state)
-        self._lock, self._samplers = threading.RLock(), OrderedDict()
+        self._lock, self._samplers = fork_lock(), OrderedDict()
         self._refresh()
         filter, self.key_filter = self.key_filter, None
         self.write_episodes(episodes)

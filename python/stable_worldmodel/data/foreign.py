@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any
 
 from stable_worldmodel import _engine
+from stable_worldmodel._forks import fork_lock
 from stable_worldmodel._overrides import is_overridden
 
 from . import _tensors
@@ -37,7 +37,7 @@ class _Rows:
             if hasattr(self._reader, name):
                 setattr(self._reader, name, value)
         self._cache: OrderedDict[tuple[int, int, int], dict[str, Array]] = OrderedDict()
-        self._lock = threading.Lock()
+        self._lock = fork_lock()
         self._left_out = _LEFT_OUT.get()
         if self._left_out is not None and getattr(reader, "episode_column_names", None):
             self._left_out.add(_tensors.EPISODE)

@@ -71,7 +71,7 @@ class Goals:
     def spec(self) -> dict[str, Any]:
         """The goal specification for the engine."""
         chances = ("random", "geometric", "future", "last", "current", "discount")
-        mixture = {chance: float(getattr(self, chance)) for chance in chances}
+        mixture = {chance: _options.finite(f"Goals.{chance}", getattr(self, chance)) for chance in chances}
         anchor = None if self.anchor is None else _options.count("Goals.anchor", self.anchor, 0)
         return {"name": self.name, "columns": [*self.columns], "anchor": anchor, "mixture": mixture}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from stable_worldmodel import _engine
+from stable_worldmodel._forks import fork_lock
 
 from . import _tensors
 from ._tensors import NUMBERING, Array
@@ -85,7 +85,9 @@ class EpisodeWriter:
         self._codec = codec_json(codec, jpeg_quality, self.format)
         self._manifest = None if manifest is None else self._provenance(manifest)
         #: Held while an episode is written, because the first one opens the dataset.
-        self._lock = threading.RLock()
+        self._lock = fork_lock()
+        #: The process that writes: that of the first episode.
+        self._process: int | None = None
         self._writer: Any = None
         self._closed = self._warned = False
         #: The columns and their types, once they are known.
@@ -112,10 +114,10 @@ class EpisodeWriter:
         return json.dumps({**made, "config": dict(given), "device": "cpu"})
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_lock": None}
+        return {**self.__dict__, "_lock": None, "_process": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _lock=threading.RLock())
+        self.__dict__.update(state, _lock=fork_lock())
 
     @property
     def num_episodes(self) -> int:
@@ -129,6 +131,7 @@ class EpisodeWriter:
         integers, or one action fewer. An action in the last row is left out, with a warning, because no observation
         follows it. Actions of `uint8` and `bool` need all rows, and the last one is stored, with a warning.
         """
+        self._check_process()
         with self._lock:
             if self._closed:
                 raise ValueError(f"{self.path}: the writer is closed; open another one with mode='append'")
@@ -148,6 +151,7 @@ class EpisodeWriter:
                 fitted = self._fitted(arrays)
                 if self._writer is None:
                     columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
+                    self._process = os.getpid()
                     self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
             except BaseException:
                 # A refused episode defines no columns.
@@ -160,6 +164,13 @@ class EpisodeWriter:
                     # To close a writer without episodes would replace the old dataset by an empty one.
                     self._writer = None
                 raise
+
+    def _check_process(self) -> None:
+        """Refuses a process that was forked from the one that writes: it lacks the threads, and writes to the same files."""
+        if self._process not in (None, os.getpid()):
+            raise ValueError(
+                f"{self.path}: the writer began to write before this process was forked; open one in the process that writes"
+            )
 
     def _fitted(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """The episode with the columns of the dataset, in their order and types."""
@@ -189,6 +200,7 @@ class EpisodeWriter:
 
     def close(self) -> None:
         """Commits the episodes and closes the writer."""
+        self._check_process()
         with self._lock:
             self._closed = True
             if self._writer is not None:

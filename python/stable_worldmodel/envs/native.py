@@ -60,7 +60,7 @@ class NativeEnv(gymnasium.Env):
         self.image_shape = (int(image_shape[0]), int(image_shape[1]))
         self.action_space = swm_spaces.from_description(self._described["action_space"])
         self.observation_space = swm_spaces.from_description(self._described["observation_space"])
-        #: Whether `variation_space` has the values of the current episode.
+        #: Whether a program has read `variation_space`, which then gets the values of every episode.
         self._factors_read = False
         columns = self._env.reset(0, _options.reset(None, {}))
         self._start = columns["state"]
@@ -92,16 +92,20 @@ class NativeEnv(gymnasium.Env):
     @property
     def variation_space(self) -> swm_spaces.Dict:
         """The factors of variation, with the values of the current episode until a program sets others."""
-        space = self._variation_space
-        if self._factors_read:
-            return space
-        self._factors_read = True
+        if not self._factors_read:
+            self._factors_read = True
+            self._fill_factors()
+        return self._variation_space
+
+    def _fill_factors(self) -> None:
+        """Writes the values of the current episode into `variation_space`, if a program has read it."""
+        if not self._factors_read:
+            return
         for key, value in self._env.factors().items():
-            factor = space.find(key)
+            factor = self._variation_space.find(key)
             factor._value = np.asarray(value).reshape(factor.shape or ()).astype(factor.dtype)
             if isinstance(factor, swm_spaces.Discrete):
                 factor._value = int(factor._value)
-        return space
 
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode. Factors, start and goal depend only on the seed and the options."""
@@ -112,7 +116,7 @@ class NativeEnv(gymnasium.Env):
         if seed is None:
             seed = int(self.np_random.integers(2**62))
         columns = self._env.reset(seed, _options.reset(options, self._described["variation"]))
-        self._factors_read = False
+        self._fill_factors()
         self._start = columns["state"]
         return self._observation(columns), self._info(columns, self._env.is_success())
 
@@ -156,14 +160,14 @@ class NativeEnv(gymnasium.Env):
     def restore(self, state: bytes) -> tuple[Any, dict[str, Any]]:
         """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
         columns = self._env.restore(state)
-        self._factors_read = False
+        self._fill_factors()
         return self._observation(columns), self._info(columns, self._env.is_success())
 
     def restore_from(self, start: Mapping[str, Any], goal: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Restores the state of the dataset row `start`, with the state of the row `goal` as the goal."""
         rows = ({key: np.asarray(value)[None] for key, value in row.items()} for row in (start, goal))
         columns = self._env.restore_from(*rows)
-        self._factors_read = False
+        self._fill_factors()
         return self._observation(columns), self._info(columns, self._env.is_success())
 
     # Evaluations from a dataset call these methods if Gymnasium wrappers contain the environment.

@@ -266,6 +266,12 @@ class Trainer:
             )
         means = [sum(column) / len(rows) for column in zip(*rows, strict=True)]
         self._write_log({f"validation/{name}": value for name, value in zip(self.losses.names, means, strict=True)})
+        if not _finite(means[0]):
+            self.save()
+            raise FloatingPointError(
+                f"the validation loss after step {self.step} is not finite; its weights are kept: look for values that are not "
+                "finite in the validation episodes (`swm doctor`), and continue with resume, or train with validation.every=0"
+            )
         if self.best is None or means[0] < self.best[1]:
             self.best, self.validations_since_best = (self.step, means[0]), 0
             self._write(self.run / "best", state=None)

@@ -135,9 +135,16 @@ def load_into(model: nn.Module, weights: Mapping[str, Tensor], source: str) -> N
     """Loads weights, renaming those of a vision transformer that `transformers` 5 saved.
 
     Raises:
-        RuntimeError: If a weight is missing, unexpected, or of another shape.
+        RuntimeError: If a weight is missing, unexpected, complex, of another shape, or given under two names.
     """
-    weights = {published(name): value for name, value in weights.items()}
+    names: dict[str, str] = {}
+    for name, value in weights.items():
+        first = names.setdefault(published(name), name)
+        if first != name:
+            raise RuntimeError(f"{source}: {first!r} and {name!r} are two names of one weight; leave one out")
+        if value.is_complex():
+            raise RuntimeError(f"{source}: the weight {name!r} is {value.dtype}; expected real numbers")
+    weights = {known: weights[name] for known, name in names.items()}
     expected = model.state_dict()
     missing = [name for name in stored_names(model) if name not in weights]
     unexpected = [name for name in weights if name not in expected]

@@ -75,7 +75,7 @@ class EnvPool:
 
     @property
     def variation_space(self) -> Any:
-        """The factors of variation; `None` if the environments have none."""
+        """The factors of variation, with the values of the first environment; `None` if the environments have none."""
         return getattr(self.envs[0].unwrapped, "variation_space", None)
 
     @property
@@ -264,7 +264,7 @@ class WorldEnvs(EnvPool):
 
     @lazy
     def variation_space(self) -> swm_spaces.Dict:
-        """The factors of variation."""
+        """The factors of variation, with their defaults as values: `World.factors` has those of an environment."""
         return swm_spaces.variation_space(self._world.spec["variation"], self._world.spec["sampling_order"])
 
     @property

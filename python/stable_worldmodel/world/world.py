@@ -235,7 +235,7 @@ class World:
 
     @property
     def variation_space(self) -> swm_spaces.Dict:
-        """The factors of variation."""
+        """The factors of variation, with their defaults as values: `factors` has those of an environment."""
         return self.envs.variation_space
 
     @property
@@ -787,6 +787,10 @@ class World:
                 raise ValueError("episodes_idx, start_steps: give both or neither")
             if episodes_idx is not None and start_steps is not None:
                 picks = _options.starts(episodes_idx, start_steps)
+                if episodes not in (None, len(picks)):
+                    raise ValueError(
+                        f"episodes: {episodes!r}; expected {len(picks)}, the length of episodes_idx, or leave it out"
+                    )
                 episodes = len(picks)
         elif episodes_idx is not None or start_steps is not None or goal_offset is not None:
             raise ValueError("episodes_idx, start_steps, goal_offset: they select rows of a dataset; pass dataset=…")

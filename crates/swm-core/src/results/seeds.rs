@@ -70,12 +70,15 @@ impl OverSeeds {
         groups.iter().flat_map(|(_, members)| of_group(members, unshifted)).collect()
     }
 
-    /// The scores of some conditions; `None` unless all conditions have the same training seeds, at least two.
+    /// The scores of some conditions; `None` unless all conditions have the same training seeds, at least two, and episodes that count.
     fn of(conditions: &[&Condition<'_>], condition: Option<&str>) -> Option<Self> {
         let (_, first) = conditions.first()?;
         let row = first.values().next()?;
         let seeds: Vec<&str> = first.keys().copied().collect();
         if seeds.len() < 2 || conditions.iter().any(|(_, rows)| !rows.keys().eq(first.keys())) {
+            return None;
+        }
+        if conditions.iter().flat_map(|(_, rows)| rows.values()).any(|row| row.success.n == 0) {
             return None;
         }
         let tasks: Vec<Vec<f64>> =
@@ -266,6 +269,9 @@ mod tests {
         rows.remove(5);
         let fewer = OverSeeds::all(&rows, "plain");
         assert_eq!(fewer.iter().map(|over| over.scores.len()).collect::<Vec<_>>(), [4, 3, 4]);
+        // Of no episodes there is no score.
+        let unplayed = |row: &StudyRow| StudyRow { success: Proportion::wilson(0, 0), ..row.clone() };
+        assert!(OverSeeds::all(&rows.iter().map(unplayed).collect::<Vec<_>>(), "plain").is_empty());
         // Two rows of one seed cannot be told from each other.
         rows.push(row("plain", 0, 1));
         assert_eq!(OverSeeds::all(&rows, "plain").len(), 2);

@@ -24,9 +24,9 @@ fn actions_of_every_space_reach_the_environment() {
         let expected: Vec<f64> = action.iter().map(|&choice| choice as f64).collect();
         assert_eq!(observed[..expected.len()], expected, "{kind}");
     }
-    // A dictionary of boxes becomes one box; a missing bound becomes 1.
+    // A dictionary of boxes becomes one box.
     let mut env = RecordedEnv::of(make("tests.it.environments:Choices-v0,kind=dict", &config));
-    let (low, high) = (vec![-1.0, -1.0, 0.0], vec![1.0; 3]);
+    let (low, high) = (vec![-1.0, -1.0, 0.0], vec![1.0, 1.0, f64::INFINITY]);
     assert_eq!(env.env.spec().action_space, Space::Box { shape: vec![3], dtype: DType::Float32, low, high });
     env.env.reset(0, &ResetOptions::default()).expect("resetting the environment");
     env.env.step(Action::Continuous(&[0.5, -0.25, 3.0])).expect("stepping the environment");

@@ -359,7 +359,7 @@ fn at_rest(space: &Space) -> Vec<f64> {
     let element = |i| {
         let (low, high) = space.bounds(i);
         match space {
-            Space::Box { .. } if low <= 0.0 && high >= 0.0 => 0.0,
+            Space::Box { .. } if (low <= 0.0 && high >= 0.0) || !(high - low).is_finite() => 0.0_f64.clamp(low, high),
             Space::Box { .. } => f64::midpoint(low, high),
             _ => low,
         }

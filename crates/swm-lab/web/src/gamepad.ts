@@ -35,7 +35,7 @@ export function ofPad(space: Space, pad: Pad, rest: number[]): number[] {
     if (Math.abs(tilt) < DEAD) continue;
     const [low, high] = bounds(space, i);
     // From rest to the bound on this side.
-    const bound = tilt < 0 ? (low ?? -1) : (high ?? 1);
+    const bound = tilt < 0 ? (low ?? rest[i] - 1) : (high ?? rest[i] + 1);
     action[i] = rest[i] + Math.min(1, Math.abs(tilt)) * (bound - rest[i]);
   }
   return action;

@@ -36,7 +36,7 @@ export function ofArrows(space: Space, held: Set<string>, rest: number[]): numbe
     const index = Math.min(axis, size(space) - 1);
     const [low, high] = bounds(space, index);
     if (space.type !== "Box") action[index] = (sign < 0 ? low : high) ?? 0;
-    else if (axis < size(space)) action[index] = (sign < 0 ? low : high) ?? sign;
+    else if (axis < size(space)) action[index] = (sign < 0 ? low : high) ?? rest[index] + sign;
   }
   return action;
 }
@@ -46,7 +46,8 @@ export function atRest(space: Space): number[] {
   return Array.from({ length: size(space) }, (_, i) => {
     const [low, high] = bounds(space, i);
     if (space.type !== "Box") return low ?? 0;
-    return (low ?? 0) <= 0 && (high ?? 0) >= 0 ? 0 : ((low ?? 0) + (high ?? 0)) / 2;
+    if ((low ?? 0) <= 0 && (high ?? 0) >= 0) return 0;
+    return low !== null && high !== null ? (low + high) / 2 : (low ?? high ?? 0);
   });
 }
 

@@ -89,7 +89,7 @@ impl Trainable for DinoWm {
             return Ok(self);
         }
         let path = weights::locate(from, cache)?;
-        let found = weights::names::to_published(weights::read(&path)?, "");
+        let found = weights::names::to_published(weights::read(&path)?, "", &path)?;
         self.backbone = weights::fill(self.backbone, &found, &path, "model.encoder")?;
         Ok(self)
     }

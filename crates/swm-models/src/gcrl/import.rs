@@ -38,7 +38,7 @@ where
     M: GoalConditioned<Config = GcrlConfig>,
 {
     let path = if from.is_dir() { from.join("weights.pt") } else { from.to_owned() };
-    let mut found = StoredWeights { weights: without_wrappers(weights::read(&path)?), path: &path };
+    let mut found = StoredWeights { weights: without_wrappers(weights::read(&path)?, &path)?, path: &path };
     let settings = path.with_file_name("config.json");
     let text = files::read(&settings, limits::JSON_BYTES)?;
     let settings: Value = serde_json::from_slice(&text).map_err(|error| found.wrong(error.to_string()))?;
@@ -78,27 +78,32 @@ fn is_optional(name: &str) -> bool {
 
 /// Removes wrapper prefixes and attention masks, and copies the weights of value networks and critics to the
 /// target networks.
-fn without_wrappers(weights: Named<HostTensor>) -> Named<HostTensor> {
+///
+/// # Errors
+/// When the file `path` has a weight with its wrapper and without.
+fn without_wrappers(weights: Named<HostTensor>, path: &Path) -> Result<Named<HostTensor>> {
     let mut plain = Named::new();
-    for (name, weight) in weights {
-        let name = name.replacen(".backbone.", ".", 1);
+    for (stored, weight) in weights {
+        let name = stored.replacen(".backbone.", ".", 1);
         if name.ends_with(".causal_mask") || name == "encoder.embeddings.mask_token" && weight.shape.len() == 3 {
             continue;
         }
-        match ["value_predictor", "critic_predictor"]
-            .into_iter()
-            .find_map(|part| Some((part, name.strip_prefix(part)?)))
-        {
+        let found =
+            ["value_predictor", "critic_predictor"].into_iter().find_map(|part| Some((part, name.strip_prefix(part)?)));
+        let names = match found {
             Some((part, rest)) if !rest.starts_with(".student.") && !rest.starts_with(".teacher.") => {
-                plain.insert(format!("{part}.student{rest}"), weight.clone());
-                plain.insert(format!("{part}.teacher{rest}"), weight);
+                vec![format!("{part}.student{rest}"), format!("{part}.teacher{rest}")]
             }
-            _ => {
-                plain.insert(name, weight);
+            _ => vec![name],
+        };
+        for name in names {
+            if plain.insert(name.clone(), weight.clone()).is_some() {
+                let problem = format!("it has the weight '{name}' under two names; one is '{stored}'");
+                return Err(Error::corrupt(path, problem, "remove one of the two, and save the file again"));
             }
         }
     }
-    names::to_published(plain, "encoder.")
+    names::to_published(plain, "encoder.", path)
 }
 
 /// Weights and the path of the weights file.

@@ -252,7 +252,7 @@ fn with_weights(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone>
         return Ok(encoder);
     }
     let path = weights::locate(from, cache)?;
-    let mut found = weights::names::to_published(weights::read(&path)?, "");
+    let mut found = weights::names::to_published(weights::read(&path)?, "", &path)?;
     if !parameters::shapes(&encoder).keys().all(|name| found.contains_key(name)) {
         let encoder_weight = |(name, weight): (String, _)| Some((name.strip_prefix("encoder.")?.to_owned(), weight));
         found = found.into_iter().filter_map(encoder_weight).collect();

@@ -77,7 +77,7 @@ pub struct DataConfig {
     pub batch_size: usize,
     /// Whether the episodes that [`swm_data::Split::default`] holds out, a tenth for validation and a tenth for
     /// testing, are left out of the training data, so that `swm eval --split test` starts from episodes no model was
-    /// trained on.
+    /// trained on. Mean, deviation and range of actions and columns are those of all episodes.
     #[serde(default)]
     pub hold_out: bool,
 }

@@ -172,7 +172,7 @@ impl<M: Trainable> DynLearner for Learner<'_, M> {
     }
 
     fn save_if_best(&mut self, loss: f64, out: &Path) -> Result<bool> {
-        let is_best = self.state.best.is_none_or(|(_, best)| loss < best);
+        let is_best = self.state.best.is_none_or(|(_, best)| loss < best || best.is_nan());
         if is_best {
             self.state.best = Some((self.state.step, loss));
             self.checkpoint().save(&out.join(BEST), None)?;

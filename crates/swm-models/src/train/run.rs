@@ -245,6 +245,10 @@ impl<'a> Run<'a> {
             self.learner.state_mut().window.add(&metrics, gradient_norm);
             if is_due(self.config.validation.every, done, steps) {
                 let loss = self.validate()?;
+                if !loss.is_finite() {
+                    stop = Some(self.not_validated(done));
+                    break;
+                }
                 validation = Some(loss);
                 stopped_early = self.record_validation(loss)?;
             }
@@ -349,6 +353,16 @@ impl<'a> Run<'a> {
         let scalars: Vec<(&str, f64)> = names.iter().map(String::as_str).zip(metrics.iter().map(|m| m.1)).collect();
         self.log.write(self.learner.state().step, &scalars)?;
         Ok(metrics.first().map_or(f64::NAN, |&(_, loss)| loss))
+    }
+
+    /// The error that the validation loss is not finite, after which the weights of the step are saved.
+    fn not_validated(&self, step: usize) -> Error {
+        Error::config(
+            "the validation loss",
+            format!("is not finite after step {step}, whose weights are kept"),
+            "look for values that are not finite in the validation episodes (`swm doctor`), and continue with --resume, or train with \
+             validation.every=0",
+        )
     }
 
     /// Saves the weights if `loss` is the lowest so far; returns whether training is to stop early.

@@ -23,8 +23,9 @@ pub(crate) use torch::BATCHES_TRACKED;
 use crate::nn::parameters::{self, HostTensor, Named};
 use burn::module::Module;
 use half::{bf16, f16};
-use pytorch_reader::{DType as Torch, PytorchError, PytorchReader};
+use pytorch_reader::{DType as Torch, PickleValue, PytorchError, PytorchReader};
 use safetensors::{Dtype, SafeTensors};
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use swm_core::{Error, Result, files};
 
@@ -99,6 +100,12 @@ fn pickled(path: &Path) -> Result<Named<HostTensor>> {
         let problem = "it has a tensor with the negative bit, whose values have the opposite sign";
         return Err(Error::corrupt(path, problem, "call `resolve_neg()` on its tensors and save them again"));
     }
+    let entries = PytorchReader::read_pickle_data(path, None).map_err(|error| damaged(path, error.to_string()))?;
+    if let Some(name) = doubled(&entries, reader.tensors()) {
+        let problem =
+            format!("it has two entries of the name '{name}', of nested dictionaries and of a name with dots");
+        return Err(Error::corrupt(path, problem, "remove one of the two, and save the file again"));
+    }
     // A tensor can repeat the elements of its storage, so its shape alone does not limit its size.
     let mut left = length.saturating_mul(LARGEST_EXPANSION).saturating_add(1 << 20);
     reader
@@ -112,6 +119,31 @@ fn pickled(path: &Path) -> Result<Named<HostTensor>> {
             Ok((name, HostTensor { shape: tensor.shape().to_vec(), values: widen(tensor.dtype(), &bytes) }))
         })
         .collect()
+}
+
+/// Returns the name of a tensor, its keys joined with dots, that is the name of another entry as well.
+fn doubled<T>(entries: &PickleValue, tensors: &HashMap<String, T>) -> Option<String> {
+    fn visit(entry: &PickleValue, name: &str, count: &mut impl FnMut(&str)) {
+        let mut inner = |key: &str, entry: &PickleValue| {
+            visit(entry, &if name.is_empty() { key.to_owned() } else { format!("{name}.{key}") }, count);
+        };
+        match entry {
+            PickleValue::Dict(entries) => entries.iter().for_each(|(key, entry)| inner(key, entry)),
+            PickleValue::List(entries) => {
+                entries.iter().enumerate().for_each(|(index, entry)| inner(&index.to_string(), entry));
+            }
+            // A tensor, among others.
+            PickleValue::Unsupported(_) => count(name),
+            _ => {}
+        }
+    }
+    let (mut seen, mut doubled) = (HashSet::new(), None);
+    visit(entries, "", &mut |name| {
+        if tensors.contains_key(name) && !seen.insert(name.to_owned()) {
+            doubled = Some(name.to_owned());
+        }
+    });
+    doubled
 }
 
 /// Converts little-endian values of a type to single precision.

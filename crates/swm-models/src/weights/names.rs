@@ -4,6 +4,8 @@
 //! when it loads a file, so a state dict that version 5 saved has the newer names.
 
 use crate::nn::parameters::Named;
+use std::path::Path;
+use swm_core::{Error, Result};
 
 /// The names in a state dict.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -40,15 +42,27 @@ fn table<T>(weights: &Named<T>, prefix: &str) -> &'static [(&'static str, &'stat
     if scaled { DINO } else { VIT }
 }
 
-/// Renames the weights of the transformer below `prefix` (such as `encoder.`) to their published names; published names
-/// are unchanged.
-pub fn to_published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
+/// Renames the weights of the file `path`, of the transformer below `prefix` (such as `encoder.`), to their published names; published
+/// names are unchanged.
+///
+/// # Errors
+/// When the file has a weight under both of its names.
+pub fn to_published<T>(weights: Named<T>, prefix: &str, path: &Path) -> Result<Named<T>> {
     let table = table(&weights, prefix);
     let is_newer = |name: &String| name.starts_with(prefix) && name.contains(".attention.q_proj.");
     if !weights.keys().any(is_newer) {
-        return weights;
+        return Ok(weights);
     }
-    rename(weights, prefix, |name, (old, new)| name.replacen(new, old, 1), table)
+    let mut published = Named::new();
+    for (name, weight) in weights {
+        let renamed = renamed(&name, prefix, |name, (old, new)| name.replacen(new, old, 1), table);
+        if published.contains_key(&renamed) {
+            let problem = format!("it has the weight '{renamed}' under two names; one is '{name}'");
+            return Err(Error::corrupt(path, problem, "remove one of the two, and save the file again"));
+        }
+        published.insert(renamed, weight);
+    }
+    Ok(published)
 }
 
 /// Renames the weights of the transformer below `prefix` from their published names to the names of `naming`.
@@ -56,26 +70,24 @@ pub fn to_naming<T>(weights: Named<T>, prefix: &str, naming: Naming) -> Named<T>
     let table = table(&weights, prefix);
     match naming {
         Naming::Published => weights,
-        Naming::Transformers5 => rename(weights, prefix, |name, (old, new)| name.replacen(old, new, 1), table),
+        Naming::Transformers5 => {
+            let change = |name: String, (old, new): (&str, &str)| name.replacen(old, new, 1);
+            weights.into_iter().map(|(name, weight)| (renamed(&name, prefix, change, table), weight)).collect()
+        }
     }
 }
 
-fn rename<T>(
-    weights: Named<T>,
+/// Returns a name whose parts were changed if it is of the transformer below `prefix`.
+fn renamed(
+    name: &str,
     prefix: &str,
     change: impl Fn(String, (&str, &str)) -> String,
     table: &[(&str, &str)],
-) -> Named<T> {
-    weights
-        .into_iter()
-        .map(|(name, tensor)| match name.strip_prefix(prefix) {
-            Some(rest) => {
-                let rest = table.iter().fold(rest.to_owned(), |name, pair| change(name, *pair));
-                (format!("{prefix}{rest}"), tensor)
-            }
-            None => (name, tensor),
-        })
-        .collect()
+) -> String {
+    match name.strip_prefix(prefix) {
+        Some(rest) => format!("{prefix}{}", table.iter().fold(rest.to_owned(), |name, pair| change(name, *pair))),
+        None => name.to_owned(),
+    }
 }
 
 #[cfg(test)]
@@ -107,8 +119,12 @@ mod tests {
             let old = set(&[&a[..], &b[..], &["predictor.mlp.fc1.weight"]].concat());
             let new = set(&[&c[..], &d[..], &["predictor.mlp.fc1.weight"]].concat());
             assert_eq!(to_naming(old.clone(), "e.", Naming::Transformers5), new);
-            assert_eq!(to_published(new, "e."), old);
-            assert_eq!(to_published(old.clone(), "e."), old);
+            let file = Path::new("weights.pt");
+            assert_eq!(to_published(new.clone(), "e.", file).expect("newer names"), old);
+            assert_eq!(to_published(old.clone(), "e.", file).expect("published names"), old);
+            let both = old.into_iter().chain(new).collect();
+            let error = to_published(both, "e.", file).expect_err("two names of one weight").to_string();
+            assert!(error.contains("under two names"), "{error}");
         }
     }
 }

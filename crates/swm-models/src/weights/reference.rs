@@ -136,7 +136,7 @@ impl Reference {
         };
         let prefix = format!("{at}.");
         let weights = std::mem::take(&mut self.weights);
-        self.weights = names::to_published(weights, &prefix);
+        self.weights = names::to_published(weights, &prefix, &self.path)?;
         // The mask token is used in pretraining with masked images only.
         self.weights.remove(&format!("{prefix}embeddings.mask_token"));
         Ok((config, image))
@@ -148,7 +148,7 @@ impl Reference {
     /// When a weight is missing.
     pub fn dinov2(&mut self, prefix: &str) -> Result<DinoConfig> {
         let weights = std::mem::take(&mut self.weights);
-        self.weights = names::to_published(weights, prefix);
+        self.weights = names::to_published(weights, prefix, &self.path)?;
         let of = |name: &str| self.shape(&format!("{prefix}{name}"));
         let projection = of("embeddings.patch_embeddings.projection.weight")?;
         let [dim, _, patch, _] = *projection else {

@@ -395,6 +395,30 @@ fn tensors_with_the_negative_bit_are_refused() {
 }
 
 #[test]
+fn nested_weights_with_the_name_of_another_weight_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("doubled.ckpt");
+    let text = |text: &str| [b"X".as_slice(), &(text.len() as u32).to_le_bytes(), text.as_bytes()].concat();
+    // A tensor of the first two values, as in `negative`.
+    let tensor = [
+        b"ctorch._utils\n_rebuild_tensor_v2\n((".to_vec(),
+        [text("storage"), b"ctorch\nFloatStorage\n".to_vec(), text("0"), text("cpu")].concat(),
+        b"K\x02tQK\x00K\x02\x85K\x01\x85\x89ccollections\nOrderedDict\n)RtR".to_vec(),
+    ]
+    .concat();
+    let values = [1.0_f32.to_le_bytes(), 2.0_f32.to_le_bytes()].concat();
+    let write = |other: &str| {
+        let nested = [text("state_dict"), b"}(".to_vec(), text("w"), tensor.clone(), b"u".to_vec()].concat();
+        let entries = [nested, text(other), tensor.clone()].concat();
+        archive(&path, &[&b"\x80\x02}("[..], &entries, b"u."].concat(), &values);
+        weights::read(&path)
+    };
+    assert_eq!(write("state").expect("different names").len(), 1);
+    let error = write("state_dict.w").expect_err("one of two weights").to_string();
+    assert!(error.contains("two entries of the name 'state_dict.w'"), "{error}");
+}
+
+#[test]
 fn weights_that_are_not_finite_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("diverged.pt");

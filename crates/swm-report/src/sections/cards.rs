@@ -42,16 +42,19 @@ fn card(html: &mut String, condition: &Condition<'_>, compared: Option<&Compared
             (class, format!("{} {}", against(verdict), percent(floor.rate)))
         }
     };
+    let interval = match p.n {
+        0 => String::new(),
+        _ => format!("95 % confidence interval {} to {}", percent(p.low), percent(p.high)),
+    };
     let _ = write!(
         html,
         "<div class=\"card\">\n<p class=\"what\"><span class=\"swatch {}\"></span>{} · {}</p>\n\
-         <p class=\"big\">{}</p>\n<p class=\"range\">95 % confidence interval {} to {}</p>\n<p class=\"verdict {}\">{}</p>\n</div>\n",
+         <p class=\"big\">{}</p>\n<p class=\"range\">{}</p>\n<p class=\"verdict {}\">{}</p>\n</div>\n",
         row.ink.class(),
         escape(&shorten(&row.label, limits::TEXT_CHARS)),
         escape(&shorten(condition.name, limits::TEXT_CHARS)),
         if p.n == 0 { "–".to_owned() } else { percent(p.rate) },
-        percent(p.low),
-        percent(p.high),
+        interval,
         verdict.0,
         verdict.1
     );

@@ -109,7 +109,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     }
     if let Some((report, file)) = reconstruction {
         emit(&format!(
-            "reconstructed images: error {:.2} of 255 (of the mean image: {:.2}), {:.1} % of the variance explained; {}\n",
+            "reconstructed images: root mean squared error {:.2} of 255 (of the mean image: {:.2}), {:.1} % of the variance explained; {}\n",
             report.rmse,
             report.rmse_of_mean,
             100.0 * report.explained,

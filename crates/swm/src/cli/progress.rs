@@ -160,8 +160,10 @@ fn training_message(progress: &Progress<'_>) -> String {
 
 /// Formats the success rate of a finished evaluation; `None` for other stages.
 fn success_rate(metrics: &[(&str, f64)]) -> Option<String> {
-    let metric = |name| metrics.iter().find(|(known, _)| *known == name).map(|(_, value)| *value as usize);
-    Some(percent(&Proportion::wilson(metric("successes")?, metric("episodes")?)))
+    let metric = |name| metrics.iter().find(|(known, _)| *known == name).map(|(_, value)| *value);
+    let [successes, n] = [metric("successes")?, metric("episodes")?].map(|count| count as usize);
+    let (low, high) = (metric("success_low")?, metric("success_high")?);
+    Some(percent(&Proportion { low, high, ..Proportion::wilson(successes, n) }))
 }
 
 #[cfg(test)]
@@ -195,6 +197,8 @@ mod tests {
     #[test]
     fn success_rate_requires_counts_of_successes_and_episodes() {
         assert_eq!(success_rate(&[("loss", 0.5)]), None);
-        assert!(success_rate(&[("successes", 1.0), ("episodes", 2.0)]).is_some_and(|rate| rate.starts_with("50 %")));
+        let metrics = |n| [("successes", n / 2.0), ("episodes", n), ("success_low", 0.125), ("success_high", 0.875)];
+        assert_eq!(success_rate(&metrics(2.0)).as_deref(), Some("50 % [12, 88]"));
+        assert_eq!(success_rate(&metrics(0.0)).as_deref(), Some("–"), "of no episodes there is no rate");
     }
 }

@@ -14,8 +14,11 @@ pub fn summary(results: &Results) -> String {
         .join("\n")
 }
 
-/// Formats a success rate with its 95 % confidence interval.
+/// Formats a success rate with its 95 % confidence interval; of no episodes there is none.
 pub fn percent(p: &Proportion) -> String {
+    if p.n == 0 {
+        return "–".to_owned();
+    }
     format!("{:.0} % [{:.0}, {:.0}]", 100.0 * p.rate, 100.0 * p.low, 100.0 * p.high)
 }
 

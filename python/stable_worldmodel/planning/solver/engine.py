@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from contextvars import ContextVar
 from functools import lru_cache
-from threading import Lock
 from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
 
 from ... import _engine, _options
+from ..._forks import fork_lock
 from ..._overrides import engine_part
 from ..adapter import Adapter
 from .callbacks import Callback
@@ -30,7 +30,7 @@ PLANS: ContextVar[list[tuple[int, int]] | None] = ContextVar("PLANS", default=No
 ACTION_SCALER: ContextVar[Any] = ContextVar("ACTION_SCALER", default=None)
 
 #: Held while a call of `solve` takes its number; not by the solvers, because locks cannot be pickled.
-_COUNTING = Lock()
+_COUNTING = fork_lock()
 
 
 class NotConfigured(RuntimeError, AttributeError):

@@ -61,7 +61,8 @@ def two_hot(x: Tensor, cfg: Any) -> Tensor:
     position = (symlog(x.reshape(-1)).clamp(low, high) - low) * ((count - 1) / (high - low))
     below = position.floor().clamp(0, count - 2)
     above = (position - below).unsqueeze(1)
-    index = below.long().unsqueeze(1)
+    # The weights of NaN are NaN, so that the loss says so.
+    index = below.nan_to_num(0).long().unsqueeze(1)
     weights = position.new_zeros(len(position), count)
     return weights.scatter(1, index, 1 - above).scatter(1, index + 1, above)
 

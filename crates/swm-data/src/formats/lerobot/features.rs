@@ -25,7 +25,9 @@ pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
         let native = native_name(column, schema);
         let reserved = ["timestamp", "frame_index", "episode_index", "index", "task_index", "task"];
         let invalid = native.contains(['/', '\\', '\0']) || native.starts_with('.');
-        if invalid || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
+        // Readers know these by their own names, which a camera could have.
+        let is_index = ["frame_index", "episode_index"].contains(&&*column.name);
+        if invalid || is_index || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
             return refuse(format!("'{native}' is not a valid LeRobot feature name"), "rename the column");
         }
         columns.push((index, native));
@@ -85,5 +87,21 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
             last_action_repeats: true,
             replaced: 0,
         }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use swm_core::ColumnSpec;
+
+    #[test]
+    fn cameras_do_not_have_the_names_of_the_indices() {
+        let schema = |name: &str| Schema::new(vec![ColumnSpec::new(name, DType::U8, [4, 4, 3])]).expect("a schema");
+        assert_eq!(stored_columns(&schema("wrist")).expect("a camera").len(), 1);
+        for name in ["frame_index", "episode_index"] {
+            let error = stored_columns(&schema(name)).expect_err("an index").to_string();
+            assert!(error.contains("rename the column"), "{error}");
+        }
     }
 }

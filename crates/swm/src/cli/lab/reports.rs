@@ -52,9 +52,9 @@ impl Reports for Pages {
         }
         let results = swm_report::read_results(&folder.join(kind.file()))?;
         let runs = results.runs.iter().take(MOST_LINES).map(|run| {
-            let rate = 100.0 * run.success.rate;
+            let rate = if run.success.n == 0 { "–".to_owned() } else { format!("{:.0} %", 100.0 * run.success.rate) };
             let condition = if run.condition == "in distribution" { "" } else { run.condition.as_str() };
-            format!("{}: {rate:.0} % of {} {condition}", run.policy, run.episodes.len()).trim_end().to_owned()
+            format!("{}: {rate} of {} {condition}", run.policy, run.episodes.len()).trim_end().to_owned()
         });
         Ok(Summary { title: results.env.clone(), lines: runs.collect() })
     }

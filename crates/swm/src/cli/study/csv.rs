@@ -1,6 +1,6 @@
 //! The tables of a study as comma-separated values.
 
-use swm_core::results::{ByDisplacement, Discrimination, StudyResults, StudyRow, Summary};
+use swm_core::results::{ByDisplacement, Discrimination, Proportion, StudyResults, StudyRow, Summary};
 use swm_core::text::printable;
 
 /// The columns of every study, after those of its variables.
@@ -80,9 +80,11 @@ pub(super) fn cells(results: &StudyResults) -> String {
 /// The values of [`COLUMNS`].
 fn of_success(row: &StudyRow) -> Vec<String> {
     let success = &row.success;
+    // Of no episodes there is no rate.
+    let of = |p: &Proportion, share: f64| if p.n == 0 { String::new() } else { share.to_string() };
     let mut cells = vec![success.successes.to_string(), success.n.to_string()];
-    cells.extend([success.rate, success.low, success.high].map(|share| share.to_string()));
-    cells.extend([row.solved_at_start.to_string(), row.floor.rate.to_string()]);
+    cells.extend([success.rate, success.low, success.high].map(|share| of(success, share)));
+    cells.extend([row.solved_at_start.to_string(), of(&row.floor, row.floor.rate)]);
     cells.extend(row.gap.as_ref().map_or(Default::default(), |gap| {
         let numbers = [gap.difference, gap.low, gap.high, gap.p, gap.p_holm, gap.design_effect];
         let [difference, low, high, p, p_holm, effect] = numbers.map(|value| value.to_string());

@@ -132,7 +132,7 @@ impl<'a> Pivot<'a> {
 
     /// The success rate of a cell with its interval, in percent, and the mark of its verdict.
     fn cell(&self, condition: usize, policy: usize) -> String {
-        self.cells.get(&(condition, policy)).map_or("–".to_owned(), |row| {
+        self.cells.get(&(condition, policy)).filter(|row| row.success.n > 0).map_or("–".to_owned(), |row| {
             let [rate, low, high] = [row.success.rate, row.success.low, row.success.high].map(|share| 100.0 * share);
             let mark = match row.gap.map(|gap| gap.verdict) {
                 Some(Verdict::Lower) => " ↓",
@@ -355,6 +355,18 @@ mod tests {
             }
             assert!(!table.contains("count 2"), "{table}");
         }
+    }
+
+    #[test]
+    fn of_no_episodes_there_is_no_rate() {
+        let mut results = results();
+        for row in &mut results.rows {
+            (row.success, row.floor, row.gap) = (Proportion::wilson(0, 0), Proportion::wilson(0, 0), None);
+        }
+        let markdown = Format::Markdown.write(&results);
+        assert_eq!(markdown.lines().nth(2), Some("| plain | – | – |"));
+        let csv = Format::Csv.write(&results);
+        assert!(csv.lines().nth(1).is_some_and(|line| line.contains(",0,0,,,,")), "{csv}");
     }
 
     #[test]

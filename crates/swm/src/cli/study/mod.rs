@@ -407,7 +407,7 @@ fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
     let rows = results.rows.iter().zip(export::conditions(results)).map(|(row, condition)| {
         let mut cells: Vec<String> = shown.iter().map(|(_, of)| of(row)).collect();
         let gap = row.gap.as_ref().map_or(["–"; 3].map(str::to_owned), compared);
-        let floor = format!("{:.0} %", 100.0 * row.floor.rate);
+        let floor = if row.floor.n == 0 { "–".to_owned() } else { format!("{:.0} %", 100.0 * row.floor.rate) };
         cells.extend([condition, row.policy.clone(), percent(&row.success), row.success.n.to_string(), floor]);
         cells.extend(gap);
         cells

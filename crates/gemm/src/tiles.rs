@@ -5,7 +5,7 @@
 //! squares are transposed in registers, and each thread lays out the panels that it multiplies. The kernels are those of `gemm-f32`, and so
 //! are all bits of a product.
 
-use crate::{Matrix, Product};
+use crate::{Factors, Matrix, Product};
 use gemm_common::microkernel::MicroKernelFn;
 use std::arch::x86_64::{
     __m256, _mm_loadu_ps, _mm256_castps128_ps256, _mm256_insertf128_ps, _mm256_shuffle_ps, _mm256_storeu_ps,
@@ -68,7 +68,7 @@ impl<const LANES: usize, const VECTORS: usize, const COLUMNS: usize> Tiles<LANES
     /// # Safety
     /// As for [`crate::gemm()`]. The processor must have the instructions of the kernels, and AVX. The product is one that
     /// [`can_multiply`] names.
-    pub unsafe fn multiply(&self, product: &Product<f32>, factors: (Option<f32>, f32), threads: usize) {
+    pub unsafe fn multiply(&self, product: &Product<f32>, factors: Factors<f32>, threads: usize) {
         let [m, n, k] = product.sides;
         let (panels, tiles) = (m.div_ceil(Self::ROWS), n.div_ceil(COLUMNS));
         let threads = if m * n * k < PARALLEL { 1 } else { threads };
@@ -97,7 +97,7 @@ impl<const LANES: usize, const VECTORS: usize, const COLUMNS: usize> Tiles<LANES
     unsafe fn multiply_part(
         &self,
         product: &Product<f32>,
-        (alpha, beta): (Option<f32>, f32),
+        factors: Factors<f32>,
         panels: Range<usize>,
         tiles: Range<usize>,
     ) {
@@ -118,11 +118,6 @@ impl<const LANES: usize, const VECTORS: usize, const COLUMNS: usize> Tiles<LANES
         let rows_of = |panel: usize| panel * Self::ROWS..m.min((panel + 1) * Self::ROWS);
         let lies_right = lhs.to_next_row == 1 && tiles.len() <= FEW;
         let is_in_place = |panel: usize| lies_right && rows_of(panel).len().is_multiple_of(LANES);
-        let alpha_kind = match alpha {
-            None | Some(0.0) => 0,
-            Some(1.0) => 1,
-            Some(_) => 2,
-        };
         for first in panels.clone().step_by(at_once) {
             let panels = first..(first + at_once).min(panels.end);
             for (panel, to) in panels.clone().zip(laid_out.chunks_exact_mut(size)) {
@@ -153,34 +148,50 @@ impl<const LANES: usize, const VECTORS: usize, const COLUMNS: usize> Tiles<LANES
                     } else {
                         Matrix::new(laid_out.as_ptr(), Self::ROWS as isize, 1)
                     };
-                    let kernel = self.0[rows.len().div_ceil(LANES) - 1][width - 1];
+                    let tile = Product { sides: [rows.len(), width, k], dst, lhs, rhs };
                     // SAFETY: the elements are those of the matrices and of panels, which have as many rows as the kernel reads.
-                    unsafe {
-                        kernel(
-                            rows.len(),
-                            width,
-                            k,
-                            dst.first,
-                            lhs.first,
-                            rhs.first,
-                            dst.to_next_column,
-                            dst.to_next_row,
-                            lhs.to_next_column,
-                            rhs.to_next_row,
-                            rhs.to_next_column,
-                            alpha.unwrap_or(0.0),
-                            beta,
-                            alpha_kind,
-                            false,
-                            false,
-                            false,
-                            core::ptr::null(),
-                        );
-                    }
+                    unsafe { self.multiply_tile(&tile, factors) };
                 }
             }
         }
         MEMORY.set(memory);
+    }
+
+    /// Computes a tile, with its left matrix column by column.
+    ///
+    /// # Safety
+    /// As for [`Self::multiply`]. The left matrix has as many rows as whole vectors hold.
+    unsafe fn multiply_tile(&self, tile: &Product<f32>, (alpha, beta): Factors<f32>) {
+        let Product { sides: [rows, columns, k], dst, lhs, rhs } = tile;
+        let kernel = self.0[rows.div_ceil(LANES) - 1][columns - 1];
+        let alpha_kind = match alpha {
+            None | Some(0.0) => 0,
+            Some(1.0) => 1,
+            Some(_) => 2,
+        };
+        // SAFETY: as for this function.
+        unsafe {
+            kernel(
+                *rows,
+                *columns,
+                *k,
+                dst.first,
+                lhs.first,
+                rhs.first,
+                dst.to_next_column,
+                dst.to_next_row,
+                lhs.to_next_column,
+                rhs.to_next_row,
+                rhs.to_next_column,
+                alpha.unwrap_or(0.0),
+                beta,
+                alpha_kind,
+                false,
+                false,
+                false,
+                core::ptr::null(),
+            );
+        }
     }
 }
 

@@ -253,10 +253,9 @@ impl<'a> Run<'a> {
                 stopped_early = self.record_validation(loss)?;
             }
             let rates = self.clock.rates(elapsed);
-            let mut shown = metrics;
-            shown.extend(validation.map(|loss| ("validation_loss", loss)));
-            shown.extend([("lr", lr), ("gradient_norm", gradient_norm)]);
-            shown.extend(rates);
+            let validated = validation.map(|loss| ("validation_loss", loss));
+            let rest = [("lr", lr), ("gradient_norm", gradient_norm)].into_iter().chain(rates);
+            let shown: Metrics = metrics.into_iter().chain(validated).chain(rest).collect();
             control.progress(Progress { stage: STAGE, done, total: steps, unit: "steps", metrics: &shown });
             if is_due(self.config.log_every, done, steps) || stopped_early {
                 let (means, norm) = self.learner.state_mut().window.take();

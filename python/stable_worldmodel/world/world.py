@@ -787,7 +787,7 @@ class World:
                 raise ValueError("episodes_idx, start_steps: give both or neither")
             if episodes_idx is not None and start_steps is not None:
                 picks = _options.starts(episodes_idx, start_steps)
-                if episodes not in (None, len(picks)):
+                if episodes is not None and _options.count("episodes", episodes) != len(picks):
                     raise ValueError(
                         f"episodes: {episodes!r}; expected {len(picks)}, the length of episodes_idx, or leave it out"
                     )

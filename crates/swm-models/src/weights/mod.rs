@@ -121,29 +121,55 @@ fn pickled(path: &Path) -> Result<Named<HostTensor>> {
         .collect()
 }
 
-/// Returns the name of a tensor, its keys joined with dots, that is the name of another entry as well.
+/// Returns the name of a tensor, its keys joined with dots, that is the name of another tensor as well.
 fn doubled<T>(entries: &PickleValue, tensors: &HashMap<String, T>) -> Option<String> {
-    fn visit(entry: &PickleValue, name: &str, count: &mut impl FnMut(&str)) {
-        let mut inner = |key: &str, entry: &PickleValue| {
-            visit(entry, &if name.is_empty() { key.to_owned() } else { format!("{name}.{key}") }, count);
-        };
-        match entry {
-            PickleValue::Dict(entries) => entries.iter().for_each(|(key, entry)| inner(key, entry)),
-            PickleValue::List(entries) => {
-                entries.iter().enumerate().for_each(|(index, entry)| inner(&index.to_string(), entry));
+    /// The tensors, those that were seen, and the length of the longest name.
+    struct Names<'a, T>(&'a HashMap<String, T>, HashSet<String>, usize);
+
+    impl<T> Names<'_, T> {
+        /// Returns the name that an entry below `name`, or one of those in it, has in common with an earlier tensor.
+        fn repeated(&mut self, entry: &PickleValue, key: &str, name: &mut String) -> Option<String> {
+            let length = name.len();
+            // Names that are too long for a tensor are not written.
+            if length + key.len() > self.2 {
+                return None;
             }
-            // A tensor, among others.
-            PickleValue::Unsupported(_) => count(name),
-            _ => {}
+            if !name.is_empty() {
+                name.push('.');
+            }
+            name.push_str(key);
+            let found = match entry {
+                PickleValue::Dict(_) | PickleValue::List(_) => self.repeated_in(entry, name),
+                _ => (self.0.contains_key(name) && !self.1.insert(name.clone())).then(|| name.clone()),
+            };
+            name.truncate(length);
+            found
+        }
+
+        fn repeated_in(&mut self, entries: &PickleValue, name: &mut String) -> Option<String> {
+            match entries {
+                PickleValue::Dict(entries) => {
+                    let mut entries = entries.iter().filter(|(_, entry)| has_tensors(entry));
+                    entries.find_map(|(key, entry)| self.repeated(entry, key, name))
+                }
+                PickleValue::List(entries) => {
+                    let mut entries = entries.iter().enumerate().filter(|(_, entry)| has_tensors(entry));
+                    entries.find_map(|(index, entry)| self.repeated(entry, &index.to_string(), name))
+                }
+                _ => None,
+            }
         }
     }
-    let (mut seen, mut doubled) = (HashSet::new(), None);
-    visit(entries, "", &mut |name| {
-        if tensors.contains_key(name) && !seen.insert(name.to_owned()) {
-            doubled = Some(name.to_owned());
+    /// Whether an entry is a tensor or may hold some.
+    fn has_tensors(entry: &PickleValue) -> bool {
+        match entry {
+            PickleValue::Dict(_) | PickleValue::List(_) => true,
+            PickleValue::Unsupported(kind) => kind == "torch.Tensor",
+            _ => false,
         }
-    });
-    doubled
+    }
+    let longest = tensors.keys().map(String::len).max().unwrap_or(0);
+    Names(tensors, HashSet::new(), longest).repeated_in(entries, &mut String::new())
 }
 
 /// Converts little-endian values of a type to single precision.

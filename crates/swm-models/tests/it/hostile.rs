@@ -414,6 +414,10 @@ fn nested_weights_with_the_name_of_another_weight_are_refused() {
         weights::read(&path)
     };
     assert_eq!(write("state").expect("different names").len(), 1);
+    // Each number in a list below a long key would have a long name.
+    let wide = [text(&"k".repeat(1 << 20)), b"](".to_vec(), b"K\x01".repeat(1 << 20), b"e".to_vec()].concat();
+    archive(&path, &[&b"\x80\x02}("[..], &text("w"), &tensor, &wide, b"u."].concat(), &values);
+    assert_eq!(weights::read(&path).expect("one tensor").len(), 1);
     let error = write("state_dict.w").expect_err("one of two weights").to_string();
     assert!(error.contains("two entries of the name 'state_dict.w'"), "{error}");
 }

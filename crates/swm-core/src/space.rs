@@ -94,8 +94,8 @@ impl Space {
         }
     }
 
-    /// Draws a value uniformly within finite bounds. An element with one finite bound is exponentially distributed from that bound on, and one without
-    /// normally, both with scale 1, as in Gymnasium.
+    /// Draws a value uniformly within finite bounds. An element with one finite bound is exponentially distributed from that bound
+    /// on, and one without normally, both with scale 1, as in Gymnasium.
     pub fn sample(&self, rng: &mut Rng) -> Vec<f64> {
         (0..self.len())
             .map(|i| {

@@ -90,17 +90,13 @@ fn without_wrappers(weights: Named<HostTensor>, path: &Path) -> Result<Named<Hos
         }
         let found =
             ["value_predictor", "critic_predictor"].into_iter().find_map(|part| Some((part, name.strip_prefix(part)?)));
-        let names = match found {
+        let of = (&*stored, path);
+        match found {
             Some((part, rest)) if !rest.starts_with(".student.") && !rest.starts_with(".teacher.") => {
-                vec![format!("{part}.student{rest}"), format!("{part}.teacher{rest}")]
+                names::insert(&mut plain, format!("{part}.student{rest}"), weight.clone(), of)?;
+                names::insert(&mut plain, format!("{part}.teacher{rest}"), weight, of)?;
             }
-            _ => vec![name],
-        };
-        for name in names {
-            if plain.insert(name.clone(), weight.clone()).is_some() {
-                let problem = format!("it has the weight '{name}' under two names; one is '{stored}'");
-                return Err(Error::corrupt(path, problem, "remove one of the two, and save the file again"));
-            }
+            _ => names::insert(&mut plain, name, weight, of)?,
         }
     }
     names::to_published(plain, "encoder.", path)

@@ -56,13 +56,22 @@ pub fn to_published<T>(weights: Named<T>, prefix: &str, path: &Path) -> Result<N
     let mut published = Named::new();
     for (name, weight) in weights {
         let renamed = renamed(&name, prefix, |name, (old, new)| name.replacen(new, old, 1), table);
-        if published.contains_key(&renamed) {
-            let problem = format!("it has the weight '{renamed}' under two names; one is '{name}'");
-            return Err(Error::corrupt(path, problem, "remove one of the two, and save the file again"));
-        }
-        published.insert(renamed, weight);
+        insert(&mut published, renamed, weight, (&name, path))?;
     }
     Ok(published)
+}
+
+/// Inserts a weight that the file at a path stores under another name.
+///
+/// # Errors
+/// When the file has the weight under a second name.
+pub fn insert<T>(weights: &mut Named<T>, name: String, weight: T, (stored, path): (&str, &Path)) -> Result<()> {
+    if weights.contains_key(&name) {
+        let problem = format!("it has the weight '{name}' under two names; one is '{stored}'");
+        return Err(Error::corrupt(path, problem, "remove one of the two, and save the file again"));
+    }
+    weights.insert(name, weight);
+    Ok(())
 }
 
 /// Renames the weights of the transformer below `prefix` from their published names to the names of `naming`.

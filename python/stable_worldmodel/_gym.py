@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -51,6 +52,8 @@ def open_world(
     except ModuleNotFoundError as error:
         raise _missing("craftax", error) from error
     envs: list[Any] = []
+    #: The entries of `info` that all environments share, so that only one warns of those without a column.
+    known: set[str] = set()
     resampled: set[str] = set()
     # Native environments render at any size, so their frames need no resizing.
     sized = {"image_shape": image} if image is not None and env_name in _engine.envs() else {}
@@ -60,6 +63,8 @@ def open_world(
             made = bridge.make(env_name, {**options, **sized}, in_python)
         except bridge.Missing as error:
             raise _missing(error.args[0], error) from error
+        known.update(made.known)
+        made.known = known
         if max_episode_steps is not None:
             made.max_episode_steps = max_episode_steps
         if nearest is not None:
@@ -79,6 +84,12 @@ def open_world(
     world = _engine.World.gymnasium(
         described, make, num_envs, image, max_episode_steps, threads, json.dumps(in_engine or []), wrap_goal
     )
+    if running := [type(layer).__name__ for layer in _layers(envs[0]) if _keeps_statistics(layer)]:
+        warnings.warn(
+            f"{env_name}: statistics of {', '.join(running)} carry over from episode to episode, so that episodes depend on "
+            "those before them and on num_envs; set update_running_mean of the wrappers to False where they must not",
+            stacklevel=3,
+        )
     return world, envs, in_engine or [], next(iter(resampled), None)
 
 
@@ -87,6 +98,13 @@ def _layers(env: Any) -> Iterator[Any]:
     while env is not None:
         yield env
         env = getattr(env, "env", None)
+
+
+def _keeps_statistics(layer: Any) -> bool:
+    """Whether a wrapper normalizes by statistics that it updates in every step, as `NormalizeObservation` of Gymnasium does."""
+    # Some wrappers return attributes of the environment inside as their own.
+    has_own = hasattr(type(layer), "update_running_mean") or "update_running_mean" in getattr(layer, "__dict__", ())
+    return has_own and bool(layer.update_running_mean)
 
 
 def is_nearest(resample: Any) -> bool | None:

@@ -59,6 +59,34 @@ def finite(name: str, value: Any) -> float:
     return number
 
 
+def valid_text(name: str, value: str) -> str:
+    """The text, if UTF-8 can hold it.
+
+    Raises:
+        ValueError: If it has half of a surrogate pair.
+    """
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        near = value[max(0, error.start - 20) : error.end + 20]
+        raise ValueError(
+            f"{name}: {near!r} has half of a surrogate pair, which UTF-8 cannot hold; give a text without it"
+        ) from None
+    return value
+
+
+def as_json(name: str, value: Any) -> str:
+    """A value as JSON for the engine.
+
+    Raises:
+        ValueError: If a text has half of a surrogate pair.
+    """
+    text = json.dumps(value)
+    if "\\ud" in text:
+        valid_text(name, json.dumps(value, ensure_ascii=False))
+    return text
+
+
 def indices(name: str, given: Any, count: int) -> list[int]:
     """The indices in a sequence of whole numbers, or where a mask of `count` booleans is true.
 

@@ -70,6 +70,9 @@ class HistoryBuffer:
             Columns `(B, k)` of values `(n_envs,)`, `(B, k * T, ..)` of values `(n_envs, T, ..)`, and with an action block
             `(B, k, action_block * D)` of the columns `block_keys`, in which only whole blocks count. `None` if an environment
             has no step, or `n` is less than 1.
+
+        Raises:
+            ValueError: If the steps differ in their columns, or in the shapes of a column.
         """
         envs = self._envs(env_ids)
         count = min(int(n), self.num_strided(envs))
@@ -78,10 +81,19 @@ class HistoryBuffer:
         blocks = min(int(n), min(len(self._steps[env]) for env in envs) // self.action_block)
         found: dict[str, Any] = {}
         for key in self._steps[envs[0]][-1]:
-            if key in self.block_keys and self.action_block > 1:
-                found[key] = _stack([self._blocks(env, key, blocks) for env in envs])
-            else:
-                found[key] = _stack([self._strided(env, key, count) for env in envs])
+            try:
+                if key in self.block_keys and self.action_block > 1:
+                    found[key] = _stack([self._blocks(env, key, blocks) for env in envs])
+                else:
+                    found[key] = _stack([self._strided(env, key, count) for env in envs])
+            except (KeyError, ValueError, RuntimeError) as error:
+                steps = [step for env in envs for step in self._steps[env]]
+                forms = sorted({str(tuple(step[key].shape)) if key in step else "missing" for step in steps})
+                if len(forms) == 1:
+                    raise
+                raise ValueError(
+                    f"HistoryBuffer: the steps differ in {key!r} ({', '.join(forms)}); append equal columns, or reset it first"
+                ) from error
         return found
 
     def reset(self, env_ids: Sequence[int] | None = None) -> None:

@@ -149,8 +149,8 @@ Policy = BasePolicy
 class _EnginePolicy(BasePolicy):
     """A policy that acts inside the engine."""
 
-    #: How often its settings changed: a `World` makes a new actor then.
-    _changes = 0
+    #: What changes with its settings, such as how often they changed: a `World` makes a new actor then.
+    _changes: Any = 0
 
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
         """The actions for the current infos of the world; `obs` is ignored."""
@@ -244,6 +244,10 @@ class MixturePolicy(_EnginePolicy):
         self.weights = {str(name): _options.finite(f"the weight of {name!r}", weight) for name, weight in weights.items()}
 
     @property
+    def _changes(self) -> Any:
+        return tuple(self.weights.items())
+
+    @property
     def _choice(self) -> list[dict[str, Any]]:
         """The policies and weights, as a manifest stores them."""
         return [{"name": name, "weight": weight} for name, weight in self.weights.items()]
@@ -252,10 +256,10 @@ class MixturePolicy(_EnginePolicy):
         actor = _engine.Actor.mixture(world._world, json.dumps(self._choice))
         own = _engine.Actor.experts(world.env_name) if world.env_name.partition(",")[0] in _engine.envs() else []
         models = [name for name in self.weights if name not in ("random", "expert", *own)]
-        if world.transforms and models:
+        if world._infos_differ and models:
             raise ValueError(
-                f"MixturePolicy: {models[0]} acts in the engine, which does not call the world's image_transform and "
-                "goal_transform; leave them out, or play it as a FeedForwardPolicy"
+                f"MixturePolicy: {models[0]} acts in the engine, where the world's image_transform, goal_transform and "
+                "goal_conditioned=False have no effect; leave them out, or play it as a FeedForwardPolicy"
             )
         return actor
 
@@ -298,7 +302,7 @@ class FeedForwardPolicy(BasePolicy):
 
     def _actor(self, world: World) -> Any:
         model = self._checkpoint()
-        if model is None or world.transforms:
+        if model is None or world._infos_differ:
             # Transforms of frames are functions in Python, so the checkpoint is called from here.
             return None
         return (_engine.Actor.checkpoint if isinstance(model, str) else _engine.Actor.model)(world._world, model)
@@ -310,12 +314,12 @@ class FeedForwardPolicy(BasePolicy):
             if self.env is None:
                 raise RuntimeError("FeedForwardPolicy: it belongs to no world; call world.set_policy(policy) first")
             world = self.env._world
-            if not world.transforms:
+            if not world._infos_differ:
                 return world._engine_actions(self)
             if isinstance(model, str):
                 from . import wm
 
-                # Only the transforms of frames need the checkpoint in Python.
+                # Only infos that differ from those of the engine need the checkpoint in Python.
                 model = self.model = wm.load(model)
         infos = prepared({key: value for key, value in info_dict.items() if key[0] != "_"}, self.process, self.transform)
         if "goal" in infos:
@@ -435,10 +439,11 @@ class MPCPolicy(BasePolicy):
         engine = engine_part(self.solver.model, "_engine_model", "get_cost")
         if engine is not None and (self.process or self.transform):
             raise ValueError("MPCPolicy: models of swm.wm scale their inputs themselves; remove process and transform")
-        if world.transforms and not simulates:
+        if world._infos_differ and not simulates:
             if engine is not None and self.cfg.history_len > 1:
                 raise ValueError(
-                    "MPCPolicy: models of swm.wm get no history in a world with image_transform; use history_len=1"
+                    "MPCPolicy: models of swm.wm get no history in a world with image_transform, goal_transform or "
+                    "goal_conditioned=False; use history_len=1"
                 )
             # Transforms of frames are functions in Python, so the solver is called from here.
             return None
@@ -589,14 +594,14 @@ def _executed(step: np.ndarray, space: Any) -> np.ndarray:
     """A planned step as an action: clipped to a `Box`, or the choices of one-hot vectors."""
     if space.dtype.kind == "f":
         return np.clip(step.reshape(space.shape), space.low, space.high).astype(space.dtype)
-    sizes = [int(n) for n in np.atleast_1d(getattr(space, "nvec", getattr(space, "n", 0)))]
+    sizes = [int(n) for n in np.reshape(getattr(space, "nvec", getattr(space, "n", 0)), -1)]
     if step.size == len(sizes):
         return step.round().astype(space.dtype)
     choices, at = [], 0
     for size in sizes:
         choices.append(int(step[at : at + size].argmax()))
         at += size
-    start = np.asarray(getattr(space, "start", 0))
+    start = np.reshape(getattr(space, "start", 0), -1)
     action: np.ndarray = np.asarray(choices, dtype=space.dtype) + start
     return action
 

@@ -49,7 +49,8 @@ class _Factor:
     def _begin(self, init_value: Any, constrain_fn: Callable[[Any], bool] | None) -> None:
         self.constrain_fn = constrain_fn
         # A default outside of the space is allowed; `check` reports it.
-        self._init_value = self._value = self._typed(init_value) if isinstance(init_value, (list, tuple)) else init_value
+        self._init_value = _copied(self._typed(init_value) if isinstance(init_value, (list, tuple)) else init_value)
+        self._value = _copied(self._init_value)
 
     def _typed(self, value: Any) -> Any:
         """The value in the type of the space, unless the conversion to integers is inexact."""
@@ -68,7 +69,7 @@ class _Factor:
 
     def reset(self) -> None:
         """Sets the value to the default."""
-        self._value = self._init_value
+        self._value = _copied(self._init_value)
 
     def contains(self, x: Any) -> bool:
         """Whether a value is in the space and satisfies the condition."""
@@ -108,7 +109,7 @@ class _Factor:
         typed = self._typed(value)
         if not self.contains(typed):
             raise OutsideError(f"{value!r} is not in {self}, or violates its constrain_fn")
-        return typed
+        return _copied(typed)
 
     def set_init_value(self, value: Any) -> None:
         """Changes the default."""
@@ -117,6 +118,11 @@ class _Factor:
     def set_value(self, value: Any) -> None:
         """Changes the current value."""
         self._value = self._allowed(value)
+
+
+def _copied(value: Any) -> Any:
+    """A value whose changes in place change no other."""
+    return value.copy() if isinstance(value, np.ndarray) else value
 
 
 class Box(_Factor, spaces.Box):  # type: ignore[misc]

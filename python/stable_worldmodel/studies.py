@@ -124,6 +124,7 @@ def run(
     small: bool = False,
     trust: bool = False,
     until: str | None = None,
+    progress: bool = True,
     **settings: Any,
 ) -> Study:
     """Runs the cells of a study that have no results in the folder, with `swm study run`.
@@ -134,6 +135,7 @@ def run(
         small: Whether to run the small size of the study: minutes on two cores.
         trust: Whether the file may name what loads code or opens connections.
         until: The rule that ends the study, such as `ci=5` or `decided`; `episodes` is the most then.
+        progress: Whether to show the output of the command: its progress and the table.
         **settings: Options of all evaluations, with `_` for `-`; a list makes a cell for each value.
 
     Returns:
@@ -144,7 +146,7 @@ def run(
     arguments += [flag for flag, is_set in (("--small", small), ("--trust", trust)) if is_set]
     arguments += [] if until is None else ["--until", until]
     arguments += [f"{name.replace('_', '-')}={_options.setting(value, name)}" for name, value in settings.items()]
-    _command(arguments)
+    _command(arguments, shows=progress)
     return read(output)
 
 

@@ -439,3 +439,44 @@ def test_columns_that_only_some_joined_datasets_have_are_counted_with_a_warning(
     for rows in ([0, 3], [3, 0]):
         with pytest.raises(KeyError, match="some rows have other columns"):
             joined.get_row_data(rows)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_joined_datasets_have_scalars_of_one_shape(tmp_path, backend):
+    torch = pytest.importorskip("torch")
+    paths = [tmp_path / name for name in ("a.lance", "b.h5")]
+    content = {"action": np.zeros((7, 1), np.float32), "reward": np.arange(8.0), "state": np.zeros((8, 1))}
+    for path in paths:
+        with data.open_writer(path) as writer:
+            writer.write_episode(content)
+    listed, scalar = (data.load_dataset(path, num_steps=2, backend=backend) for path in paths)
+    seen = []
+    listed.transform = lambda sample: seen.extend(value.shape[1:] for value in sample.values()) or sample
+    buffer = data.ReplayBuffer(100, history_len=2)
+    merged = data.MergeDataset([listed, listed], [["reward", "action"], ["state"]])
+    # Samples of a buffer are arrays.
+    with_buffer = [[listed, buffer]] if backend == "numpy" else []
+    for parts in ([listed, scalar], [scalar, merged], [listed, data.ConcatDataset([scalar, scalar])], *with_buffer):
+        joined = data.ConcatDataset(parts)
+        if buffer in parts:
+            buffer.write_episode(content)
+        first, last = joined[0], joined[len(joined) - 1]
+        for sample in (first, last):
+            shapes = {name: tuple(value.shape) for name, value in sample.items()}
+            assert shapes == {"action": (2, 1), "reward": (2,), "state": (2, 1)}
+        chunks = joined.load_chunk([0, 1], [0, 0], [4, 4])
+        episodes = [joined.load_episode(index) for index in (0, -1)]
+        for sample, length in ((chunks[0], 4), (chunks[1], 4), (episodes[0], 8), (episodes[1], 8)):
+            assert np.array_equal(sample["reward"], content["reward"][:length]) and sample["state"].shape == (length, 1)
+        rows = len(joined.get_col_data("reward"))
+        assert joined.get_col_data("reward").shape == (rows,) and joined.get_col_data("state").shape == (rows, 1)
+        found = joined.get_row_data([0, rows - 1])
+        assert found["reward"].tolist() == [0, 7] and found["action"].shape == (2, 1) and found["state"].shape == (2, 1)
+        assert np.shape(joined.get_row_data(0)["reward"]) == ()
+        batches = torch.utils.data.DataLoader(joined, batch_size=5, shuffle=True)
+        assert all(tuple(batch["reward"].shape) == (len(batch["action"]), 2) for batch in batches)
+        assert all(batch["reward"].ndim == 2 for batch in data.Loader(joined, 5))
+        goals = data.GoalDataset(joined, (1.0, 0.0, 0.0, 0.0), goal_keys={"reward": "goal"}, seed=0)
+        assert {tuple(goals[i]["goal"].shape) for i in range(len(goals))} == {(1,)}
+    assert set(seen) == {(1,)}, "transforms get the samples of their dataset"
+    assert data.ConcatDataset([listed, listed])[0]["reward"].shape == (2, 1)

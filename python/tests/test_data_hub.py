@@ -1,5 +1,6 @@
 """Tests of datasets of a hub, on a server of this machine."""
 
+import hashlib
 import http.server
 import json
 import threading
@@ -12,15 +13,23 @@ import stable_worldmodel as swm
 COMMIT = "a" * 40
 
 
+def git_id(content):
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+
+
 class Hub(http.server.BaseHTTPRequestHandler):
     """A hub with one repository, whose files are those of `folder`."""
 
     folder = None
+    down = False
 
     def log_message(self, *words):
         pass
 
     def do_GET(self):
+        if self.down:
+            self.close_connection = True
+            return
         path = urllib.parse.unquote(self.path.partition("?")[0])
         files = [file for file in sorted(self.folder.rglob("*")) if file.is_file()]
         names = {str(file.relative_to(self.folder.parent)): file for file in files}
@@ -28,7 +37,8 @@ class Hub(http.server.BaseHTTPRequestHandler):
             body = json.dumps({"id": "owner/name", "sha": COMMIT}).encode()
         elif path.startswith(f"/api/datasets/owner/name/tree/{COMMIT}"):
             listed = [
-                {"type": "file", "path": name, "size": file.stat().st_size, "oid": "0" * 40} for name, file in names.items()
+                {"type": "file", "path": name, "size": file.stat().st_size, "oid": git_id(file.read_bytes())}
+                for name, file in names.items()
             ]
             body = json.dumps(listed).encode()
         else:
@@ -64,3 +74,10 @@ def test_datasets_of_a_hub_are_read_by_their_uri(hub, tmp_path):
     # Results name the commit, so that they can be compared with those of the same rows.
     assert found["config"]["dataset"] == f"hf://datasets/owner/name@{COMMIT}/rooms.lance"
     assert found["hashes"]["dataset"] == swm.data.inspect(tmp_path / "rooms.lance")["content_hash"]
+
+
+def test_cached_files_that_are_read_without_a_connection_are_a_warning(hub, monkeypatch):
+    swm.data.load_dataset(hub)
+    monkeypatch.setattr(Hub, "down", True)
+    with pytest.warns(UserWarning, match="downloaded before"):
+        assert swm.data.load_dataset(hub).num_episodes == 3

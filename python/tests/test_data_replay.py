@@ -98,6 +98,59 @@ def test_an_action_in_the_last_row_is_kept():
         buffer.write_episode(missing)
 
 
+def test_negative_indices_count_from_the_end_as_in_stored_datasets(tmp_path):
+    buffer = data.ReplayBuffer(100, history_len=2)
+    buffer.write_episodes(episodes())
+    buffer.dump(tmp_path / "a.lance")
+    stored = data.load_dataset(tmp_path / "a.lance", num_steps=2, backend="numpy")
+    for both in (lambda it: it[-1], lambda it: it.load_episode(-1), lambda it: it.load_chunk([-1], [0], [3])[0]):
+        np.testing.assert_array_equal(both(buffer)["state"], both(stored)["state"])
+    for rows in (-1, [-2, 0]):
+        np.testing.assert_array_equal(buffer.get_row_data(rows)["state"], stored.get_row_data(rows)["state"])
+    for dataset in (buffer, stored):
+        with pytest.raises(IndexError, match="episode 9 is outside the dataset, which has"):
+            dataset.load_episode(9)
+        with pytest.raises(IndexError, match=r"rows \[-101\] are outside the dataset"):
+            dataset.get_row_data(-101)
+
+
+def test_lengths_cannot_be_written_to(tmp_path):
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episodes(episodes())
+    buffer.dump(tmp_path / "a.lance")
+    stored = data.load_dataset(tmp_path / "a.lance")
+    for dataset in (buffer, stored, pickle.loads(pickle.dumps(stored)), copy.deepcopy(stored)):
+        for rows in (dataset.lengths, dataset.offsets):
+            with pytest.raises(ValueError, match="read-only"):
+                rows[0] = 1
+
+
+def test_joined_buffers_are_read_as_they_were_when_another_thread_clears_them():
+    class Cleared(data.ReplayBuffer):
+        """A buffer that another thread clears between the counts of a joined dataset and its reads."""
+
+        def __getitem__(self, idx):
+            joined[0].clear()
+            return super().__getitem__(idx)
+
+        def load_episode(self, episode_idx):
+            joined[0].clear()
+            return super().load_episode(episode_idx)
+
+        def load_chunk(self, *run):
+            joined[0].clear()
+            return super().load_chunk(*run)
+
+    for read in (lambda it: it[-1], lambda it: it.load_episode(-1), lambda it: it.load_chunk([-1], [0], [8])[0]):
+        joined = [Cleared(100, history_len=2)]
+        joined[0].write_episodes(episodes())
+        expected = read(joined[0]._now)
+        both = data.ConcatDataset(joined)
+        np.testing.assert_array_equal(read(both)["state"], expected["state"])
+        with pytest.raises(IndexError, match="outside the dataset, which has 0"):
+            read(both)
+
+
 def numbered(length):
     """An episode whose rows have their number and the length of the episode."""
     return {"action": np.ones((length, 1), np.float32), "length": np.full(length, length), "row": np.arange(length)}

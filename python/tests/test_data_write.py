@@ -8,6 +8,7 @@ import sys
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -333,6 +334,25 @@ def numpy_format():
     del data.FORMATS["npz"]
 
 
+def test_texts_with_half_of_a_surrogate_pair_are_named(tmp_path):
+    class Named:
+        type = "mine\udcff"
+
+        def get_action(self, infos):
+            return np.zeros((1, 2), np.float32)
+
+    wrong = {**episode(0, 5), "scene": "a room\udcff"}
+    with data.open_writer(tmp_path / "a.lance") as writer:
+        for write_to in (writer, data.ReplayBuffer(100)):
+            with pytest.raises(ValueError, match=r"column 'scene': 'a room\\udcff' has half of a surrogate pair"):
+                write_to.write_episode(wrong)
+            write_to.write_episode({**wrong, "scene": "a room \U0001f600"})
+    with swm.World("swm/TwoRoom-v1", add_pixels=False, max_episode_steps=3) as world:
+        for play in (partial(world.collect, tmp_path / "b.lance"), partial(world.evaluate, floor=False)):
+            with pytest.raises(ValueError, match=r"World\.(collect|evaluate): .*mine\\udcff.* has half of a surrogate pair"):
+                play(episodes=1, policy=Named(), progress=False)
+
+
 def test_user_defined_format_is_read_written_and_converted(tmp_path, numpy_format):
     assert data.get_format("npz") is numpy_format and "npz" in data.list_formats()
     assert data.detect_format(tmp_path / "x.npzs") is numpy_format
@@ -350,6 +370,12 @@ def test_user_defined_format_is_read_written_and_converted(tmp_path, numpy_forma
         same({**found, "pixels": found["pixels"].transpose(0, 2, 3, 1)}, content)
     with pytest.raises(FileExistsError):
         data.convert(tmp_path / "b.lance", tmp_path / "c", dest_format="npz", progress=False)
+    # Evaluations start from rows that the engine reads.
+    with swm.World("swm/TwoRoom-v1", add_pixels=False) as world:
+        world.set_policy(swm.policy.RandomPolicy())
+        for given, error in ((tmp_path / "a.npzs", ValueError), (dataset, TypeError)):
+            with pytest.raises(error, match="a format of the engine.*swm.data.convert"):
+                world.evaluate(dataset=given, episodes=1, progress=False)
     # The loader returns the same batches from both formats.
     npz_loader = data.Loader(dataset, 8, backend="numpy")
     lance_loader = data.Loader(tmp_path / "b.lance", 8, num_steps=3, frameskip=2, columns=dataset.column_names, backend="numpy")

@@ -59,6 +59,15 @@ def test_steps_are_copied_and_tensors_stay_tensors():
     assert found["x"].tolist() == [[0.0]] and torch.is_tensor(found["y"]) and found["y"].shape == (1, 2, 3)
 
 
+@pytest.mark.parametrize("blocks", [(), ("action",)])
+def test_changed_columns_are_named(blocks):
+    for change, form in (({"action": np.zeros((2, 1, 3))}, r"\(1, 2\), \(1, 3\)"), ({"new": np.zeros(2)}, r"\(\), missing")):
+        buffer = filled(3, action_block=2, block_keys=blocks)
+        buffer.append({**step(3), **change})
+        with pytest.raises(ValueError, match=f"the steps differ in '{next(iter(change))}' \\({form}\\)"):
+            buffer.get(2)
+
+
 def test_wrong_sizes_are_named():
     with pytest.raises(ValueError, match="HistoryBuffer: action_block: 0; expected a whole number of at least 1"):
         HistoryBuffer(1, 3, action_block=0)

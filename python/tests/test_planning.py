@@ -239,6 +239,25 @@ def test_model_runs_in_inference_mode_except_for_gradients():
     assert (False, False, True) in seen
 
 
+@pytest.mark.parametrize("solver", [solvers.CEMSolver, solvers.GradientSolver])
+def test_planning_restores_the_mode_of_a_model(solver):
+    class Recording(Quadratic):
+        def get_cost(self, info_dict, action_candidates):
+            seen.append((self.training, self.frozen.training))
+            return super().get_cost(info_dict, action_candidates)
+
+    seen = []
+    model = Recording().train()
+    model.frozen = torch.nn.Identity().eval()
+    made = configured(few(solver, model))
+    for _ in range(2):
+        made.solve(infos())
+        assert model.training and not model.frozen.training and set(seen) == {(False, False)}
+    model.eval()
+    made.solve(infos())
+    assert not model.training
+
+
 def test_infos_cached_by_a_model_last_for_one_search():
     computed = []
 
@@ -556,6 +575,83 @@ def test_discrete_actions_are_planned_and_executed():
             assert (world.infos["action"] == 1).all()
 
 
+class Choosing(gymnasium.Env):
+    """An environment with any action space."""
+
+    observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float32)
+
+    def __init__(self, space, render_mode=None):
+        self.action_space = space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+class Last:
+    """The cost of a candidate falls with the options that it chooses."""
+
+    backend = "numpy"
+
+    def get_cost(self, infos, candidates):
+        return -(candidates * np.arange(candidates.shape[3], dtype=np.float32)).sum((2, 3))
+
+
+@pytest.mark.parametrize("world", [{}, {"image_transform": lambda frame: frame}])
+@pytest.mark.parametrize(
+    ("space", "last"),
+    [
+        (gymnasium.spaces.MultiDiscrete([3, 4], start=[2, 5]), [4, 8]),
+        (gymnasium.spaces.MultiDiscrete([[2, 2], [3, 3]]), [1, 1, 2, 2]),
+        (gymnasium.spaces.MultiBinary(3), [1, 1, 1]),
+        (gymnasium.spaces.Box(1, 4, (2,), np.uint8), [4, 4]),
+    ],
+)
+def test_several_discrete_choices_are_planned_and_executed(space, last, world):
+    gymnasium.register("Choosing-v0", entry_point=lambda **given: Choosing(space, **given), max_episode_steps=5)
+    config = swm.PlanConfig(horizon=2, receding_horizon=1)
+    try:
+        with swm.World("Choosing-v0", num_envs=2, add_pixels=False, **world) as world:
+            world.set_policy(swm.policy.MPCPolicy(solvers.CategoricalCEMSolver(Last(), num_samples=99, topk=9), config))
+            world.reset(seed=0)
+            world.step(2)
+            assert world.infos["action"][:, 0].tolist() == [last] * 2
+            world.set_policy(swm.policy.MPCPolicy(solvers.CEMSolver(Last()), config))
+            with pytest.raises(ValueError, match="solver cem: it plans continuous actions"):
+                world.step()
+    finally:
+        gymnasium.registry.pop("Choosing-v0")
+
+
+class NumpyLinear:
+    """A `Linear` of arrays."""
+
+    latent_dim = 2
+
+    def encode(self, info_dict):
+        return np.asarray(info_dict["target"])[:, -1]
+
+    encode_goal = encode
+
+    def predict(self, latents, actions):
+        return latents + np.asarray(actions)
+
+
+def test_latent_dynamics_of_arrays_are_planned_with_but_have_no_gradient():
+    dynamics = NumpyLinear()
+    with pytest.raises(TypeError, match="NumpyLinear: encode and encode_goal give ndarray, ndarray; expected torch tensors"):
+        plan(solvers.GRASPSolver(dynamics))
+    dynamics.backend = "numpy"
+    with pytest.raises(ValueError, match="solver grasp: it needs the gradient"):
+        plan(solvers.GRASPSolver(dynamics))
+    # The latent is the goal already.
+    assert np.allclose(plan(solvers.CEMSolver(dynamics, num_samples=99, n_steps=20, topk=9)).sum(1), 0, atol=0.1)
+
+
 SLOW = """
 import sys, time
 import stable_worldmodel as swm
@@ -710,7 +806,7 @@ class Nearest:
 
 def executed(solver, process=None, settings=None, **world):
     """The first action that is executed."""
-    with swm.World("swm/TwoRoom-v1", 1, image_shape=(32, 32), **world) as world:
+    with swm.World("swm/TwoRoom-v1", 1, **{"image_shape": (32, 32), **world}) as world:
         config = swm.PlanConfig(horizon=1, receding_horizon=1, **(settings or {}))
         world.set_policy(swm.policy.MPCPolicy(solver, config, process=process))
         world.reset(seed=0)
@@ -805,6 +901,23 @@ def test_transforms_of_frames_reach_the_models_of_the_engine():
             world.step()
             actions.append(world.infos["action"].copy())
     assert not np.allclose(*actions, atol=1e-2)
+
+
+def test_models_get_no_goal_where_the_world_has_none():
+    class Seen:
+        def get_cost(self, infos, candidates):
+            seen.update(infos)
+            return (candidates**2).sum((2, 3))
+
+    seen = {}
+    for given in (True, False):
+        seen.clear()
+        executed(solvers.CEMSolver(Seen(), num_samples=8, n_steps=1, topk=2), goal_conditioned=given)
+        assert ("goal" in seen) == given and "pixels" in seen
+    model = swm.wm.load("zoo:two-room/pldm")
+    solver = solvers.CEMSolver(model, num_samples=8, n_steps=1, topk=2)
+    with pytest.raises(ValueError, match="'goal'"):
+        executed(solver, settings={"action_block": model.action_block}, image_shape=(64, 64), goal_conditioned=False)
 
 
 def test_mixtures_with_checkpoints_refuse_transforms_of_frames():

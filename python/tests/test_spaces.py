@@ -36,6 +36,22 @@ def test_sampled_values_satisfy_the_condition_and_reset_restores_defaults():
     assert space.value["shape"] == 1
 
 
+def test_changes_of_a_value_in_place_do_not_change_the_default():
+    given = np.array([9, 9, 9], np.uint8)
+    color = swm_spaces.RGBBox(init_value=given)
+    for _ in range(2):
+        color.value[:] = 7
+        given[:] = 3
+        assert color.init_value.tolist() == [9, 9, 9]
+        color.reset()
+        assert color.value.tolist() == [9, 9, 9]
+    given[:] = 5
+    color.set_init_value(given)
+    color.set_value(given)
+    given[:] = 1
+    assert color.init_value.tolist() == color.value.tolist() == [5, 5, 5]
+
+
 def test_all_factors_of_a_group_are_sampled_and_values_pinned():
     space = factors()
     space.seed(1)

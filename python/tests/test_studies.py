@@ -70,6 +70,15 @@ def test_a_study_of_another_kind_has_its_own_columns(tmp_path):
     assert study.export("markdown").startswith("| environment | native, factors |")
 
 
+def test_a_study_runs_without_output_where_none_is_wanted(tmp_path, capfd):
+    (tmp_path / "study.toml").write_text(STUDY)
+    for shown in (True, False):
+        swm.studies.run(tmp_path / "study.toml", tmp_path / str(shown), episodes=2, progress=shown)
+        assert bool("".join(capfd.readouterr())) == shown
+    with pytest.raises(ValueError, match="'width=5' is no rule"):
+        swm.studies.run(tmp_path / "study.toml", tmp_path / "other", until="width=5", progress=False)
+
+
 def test_settings_of_numpy_are_those_of_python(tmp_path):
     (tmp_path / "study.toml").write_text(STUDY)
     study = swm.studies.run(tmp_path / "study.toml", tmp_path / "out", episodes=np.int64(2), seed=np.array([0, 1]))

@@ -1,12 +1,13 @@
 """Tests that checkpoints of the engine and of the published package load as torch modules, as data only."""
 
+import contextlib
 import json
 import os
 import resource
 import threading
 import warnings
 import zipfile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
@@ -267,9 +268,17 @@ def test_files_of_the_user_and_of_the_engine_are_not_replaced(home):
     with pytest.raises(FileExistsError, match="did not write"):
         save_pretrained(model, "changed", config)
     # Its own files are replaced, whatever the configuration.
-    for plain in ({"hidden": 3}, {}, [1, 2], config):
+    for plain in ({"hidden": 3}, {}, [1, 2], {**config, "_partial_": True}, config):
         for _ in range(2):
-            save_pretrained(model, f"plain-{type(plain).__name__}-{len(plain)}", plain)
+            with warnings.catch_warnings(record=True) as found:
+                warnings.simplefilter("always")
+                save_pretrained(model, f"plain-{type(plain).__name__}-{len(plain)}", plain)
+            assert ["describes no module" in str(warning.message) for warning in found] == [True] * (plain != config)
+    # The configuration that it would write again is its own, also after the other weights were removed.
+    save_pretrained(model, "again", config)
+    (home / "checkpoints/again/weights.pt").unlink()
+    save_pretrained(model, "again", config, filename="second.pt")
+    assert isinstance(load_pretrained("again"), torch.nn.Linear)
     (folder / "weights.safetensors").write_text("weights of the engine")
     with pytest.raises(FileExistsError, match="of the engine"):
         save_pretrained(model, "mine", filename="new.pt")
@@ -417,6 +426,39 @@ def test_pickled_code_of_weights_does_not_run(home, tmp_path):
     with pytest.raises(Exception, match="weights_only|Weights only"):
         probes.load_probe(torch.nn.Linear(1, 1), "x", folder / "weights.pt")
     assert not (tmp_path / "ran").exists()
+
+
+def test_other_objects_in_weights_are_named(home):
+    folder = home / "checkpoints/run"
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 2}))
+    given = {"state_dict": torch.nn.Linear(2, 2).state_dict(), "hyper_parameters": {"root": PurePosixPath("data")}}
+    torch.save(given, folder / "last.ckpt")
+    with pytest.raises(RuntimeError, match="last.ckpt: it holds objects of 'pathlib.PurePosixPath'.*swm checkpoints import"):
+        load_pretrained(folder / "last.ckpt")
+
+
+def test_weights_with_nan_are_refused(home):
+    config = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 2}
+    model = torch.nn.Linear(2, 2)
+    for bad, match in ((float("inf"), None), (float("nan"), "'bias' has NaN")):
+        torch.nn.init.constant_(model.bias, bad)
+        save_pretrained(model, "mine", config)
+        with contextlib.nullcontext() if match is None else pytest.raises(RuntimeError, match=match):
+            load_pretrained("mine")
+
+
+def test_extra_states_that_are_no_tensors_are_not_saved(home):
+    class Extra(torch.nn.Linear):
+        def get_extra_state(self):
+            return {"step": 3}
+
+        def set_extra_state(self, state):
+            pass
+
+    with pytest.raises(ValueError, match="'_extra_state' of its state dict is no tensor"):
+        save_pretrained(Extra(2, 2), "mine", {"_target_": "torch.nn.Linear"})
+    assert not home.exists()
 
 
 def test_probes_are_kept_with_the_model(tmp_path):

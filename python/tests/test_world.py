@@ -131,6 +131,27 @@ def test_mixtures_with_noise_equal_for_any_number_of_environments(tmp_path):
         world.collect(tmp_path / "c.lance", episodes=1, policy=mixture, action_noise=-1, progress=False)
 
 
+@pytest.mark.parametrize("in_place", [True, False])
+def test_changed_weights_of_a_mixture_reach_its_world(in_place):
+    def first_actions():
+        world.reset(seed=0)
+        world.step()
+        return world.infos["action"].copy()
+
+    world = rooms()
+    random, expert = ({"expert": 1e-9, "random": 1}, {"expert": 1e9, "random": 1})
+    world.set_policy(swm.policy.MixturePolicy(expert))
+    expected = first_actions()
+    mixture = swm.policy.MixturePolicy(random)
+    world.set_policy(mixture)
+    assert not np.array_equal(first_actions(), expected)
+    if in_place:
+        mixture.weights["expert"] = 1e9
+    else:
+        mixture.weights = expert
+    assert np.array_equal(first_actions(), expected)
+
+
 def test_python_policy_collects_new_and_appended_episodes(tmp_path):
     world = rooms(max_episode_steps=6)
     policy = Zero(0.5)

@@ -6,7 +6,7 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.wrappers import RescaleAction, TransformObservation
+from gymnasium.wrappers import RescaleAction, TimeAwareObservation, TimeLimit, TransformObservation
 
 import stable_worldmodel as swm
 from stable_worldmodel.wrapper.visual import GrayscaleWrapper, NoiseWrapper
@@ -118,6 +118,19 @@ def test_first_infos_of_a_recorded_start_have_the_goal(tmp_path):
 def test_time_limit_is_that_of_the_environment(world):
     with swm.World(world.env_name, num_envs=1, image_shape=(32, 32)) as plain:
         assert world.max_episode_steps == plain.max_episode_steps
+
+
+def test_wrappers_that_need_a_time_limit_are_told_where_it_is():
+    given = {"image_shape": (16, 16), "max_episode_steps": 4}
+    with pytest.raises(
+        ValueError, match="The engine enforces the time limit, .* TimeAwareObservation\\(TimeLimit\\(env, 100\\)\\)"
+    ):
+        swm.World("CartPole-v1", extra_wrappers=[TimeAwareObservation], **given)
+    with swm.World("CartPole-v1", extra_wrappers=[lambda env: TimeAwareObservation(TimeLimit(env, 4))], **given) as world:
+        world.set_policy(swm.policy.RandomPolicy())
+        world.reset(seed=0)
+        world.step(2)
+        assert world.infos["observation"].shape == (1, 1, 5) and world.infos["observation"][0, 0, 4] == 2
 
 
 def test_camera_views_are_refused():

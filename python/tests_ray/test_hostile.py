@@ -136,7 +136,7 @@ def test_files_of_the_user_in_the_output_are_refused_before_the_work(rooms, tmp_
         (user / name).write_text("mine")
     (tmp_path / "study.toml").write_text(
         'title = "T"\nquestion = "q?"\n[defaults]\nenv = "swm/TwoRoom-v1"\nepisodes = 1\nno-pixels = true\n'
-        '[[condition]]\nname = "c"\n[[policy]]\nname = "p"\npolicy = "random"\n'
+        '[[condition]]\nname = "c"\n[[policy]]\nname = "random"\npolicy = "random"\n'
     )
     (tmp_path / "link").symlink_to(user)
     for arguments in (

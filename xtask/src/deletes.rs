@@ -19,7 +19,8 @@ const ALLOWED: &[(&str, &str)] = &[
 
 /// Whether the check covers a file: not tests, which delete their own folders, and not the tools of developers.
 fn covered(path: &str) -> bool {
-    !path.starts_with("xtask/") && !path.starts_with("fuzz/") && !path.contains("/tests/") && path != HOME
+    let is_test = path.contains("/tests/") || path.ends_with("/tests.rs");
+    !path.starts_with("xtask/") && !path.starts_with("fuzz/") && !is_test && path != HOME
 }
 
 /// Returns a sentence for each call that deletes outside the module, and for each exception that is no longer needed.

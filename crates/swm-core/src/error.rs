@@ -3,7 +3,7 @@
 //! Every message states what was given, what was expected, and what to do. The command line maps variants to exit
 //! codes, and the Python package maps them to exceptions.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// The result of every fallible function of the workspace.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -80,7 +80,7 @@ pub enum Error {
         fix: String,
     },
     /// A file operation failed.
-    #[error("{}: {action}: {}{}", .path.display(), without_code(.source), hint(.source))]
+    #[error("{}: {action}: {}{}", .path.display(), without_code(.source), hint(.path, .source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -244,11 +244,16 @@ fn without_code(source: &std::io::Error) -> String {
 }
 
 /// What to do about an error of the operating system.
-fn hint(source: &std::io::Error) -> &'static str {
+fn hint(path: &Path, source: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind;
     match source.kind() {
-        std::io::ErrorKind::NotFound => "; check the path",
-        std::io::ErrorKind::PermissionDenied => "; change the permissions, or choose another path",
-        std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => " (free some space, then continue)",
+        ErrorKind::NotFound | ErrorKind::PermissionDenied if path.is_relative() && std::env::current_dir().is_err() => {
+            "; the current folder was deleted: change to one that exists"
+        }
+        ErrorKind::NotFound => "; check the path",
+        ErrorKind::PermissionDenied => "; change the permissions, or choose another path",
+        ErrorKind::InvalidFilename => "; choose a shorter name or path (temporary files add to the name)",
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => " (free some space, then continue)",
         _ => "",
     }
 }
@@ -275,6 +280,11 @@ mod tests {
         assert_eq!(error.to_string(), "a.json: opening the file: No such file or directory; check the path");
         assert!(error.is_usage());
         assert!(!Error::io("a", "writing", std::io::Error::from_raw_os_error(28)).is_usage());
+        let error = Error::io("a", "writing", std::io::Error::from_raw_os_error(36)).to_string();
+        assert_eq!(
+            error,
+            "a: writing: File name too long; choose a shorter name or path (temporary files add to the name)"
+        );
     }
 
     #[test]

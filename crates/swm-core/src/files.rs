@@ -148,9 +148,20 @@ pub fn check_own(path: &Path, is_own: impl FnOnce(&Path) -> bool) -> Result<()> 
         None => return Ok(()),
         Some(found) if found.is_dir() => "is a folder; a file is written there",
         Some(found) if found.is_file() && is_own(path) => return Ok(()),
+        // A file that cannot be read may be the program's own.
+        Some(found) if found.is_file() && is_unreadable(path) => {
+            let problem = "exists, and you have no permission to read it";
+            let fix = "change the permissions, or choose another path";
+            return Err(Error::config(path.display().to_string(), problem, fix));
+        }
         Some(_) => "exists and was not written by this program",
     };
     Err(Error::config(path.display().to_string(), problem, "move it away, or choose another path"))
+}
+
+/// Whether the user has no permission to read a file.
+fn is_unreadable(path: &Path) -> bool {
+    File::open(path).is_err_and(|error| error.kind() == ErrorKind::PermissionDenied)
 }
 
 /// Checks that a path does not end in a symbolic link. Folders before its last name may be links.
@@ -406,94 +417,4 @@ fn unlink(path: &Path) -> std::io::Result<()> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use std::fs;
-
-    /// A new folder below the system's folder of temporary files.
-    fn folder(name: &str) -> PathBuf {
-        let path = std::env::temp_dir().join(format!("swm-files-{name}-{}", std::process::id()));
-        fs::create_dir_all(&path).expect("creating the folder");
-        path
-    }
-
-    #[test]
-    fn sparse_files_are_not_read() {
-        let folder = folder("sparse");
-        let path = folder.join("weights");
-        for start in [&b""[..], b"a header"] {
-            fs::write(&path, start).expect("writing the file");
-            File::options().write(true).open(&path).and_then(|file| file.set_len(20 << 30)).expect("a longer file");
-            let error = read(&path, u64::MAX).expect_err("a sparse file").to_string();
-            assert!(error.contains("sparse") && error.contains("21474836480"), "{error}");
-        }
-        let long = vec![7; (LONG + 1) as usize];
-        fs::write(&path, &long).expect("writing the file");
-        assert!(read(&path, u64::MAX).expect("a file") == long);
-        fs::remove_dir_all(&folder).expect("removing the folder");
-    }
-
-    #[test]
-    fn temporary_files_of_killed_writers_are_deleted() {
-        let root = folder("temporary");
-        for name in [".results.json.12.tmp", ".results.json.x.tmp", ".thesis.12.tmp", "results.json"] {
-            fs::write(root.join(name), name).expect("writing a file");
-        }
-        delete_temporary(&root, |name| name == "results.json").expect("deleting");
-        let mut left: Vec<_> = fs::read_dir(&root).expect("reading").flatten().map(|entry| entry.file_name()).collect();
-        left.sort();
-        assert_eq!(left, [".results.json.x.tmp", ".thesis.12.tmp", "results.json"]);
-        fs::remove_dir_all(root).expect("cleaning up");
-    }
-
-    #[test]
-    fn delete_keeps_links_folders_and_names_that_match_no_pattern() {
-        let root = folder("delete");
-        let (run, outside) = (root.join("run"), root.join("outside.txt"));
-        fs::create_dir_all(run.join("weights.bin.d")).expect("creating a folder");
-        fs::write(&outside, "thesis").expect("writing a file");
-        for name in ["config.json", "thesis.tex"] {
-            fs::write(run.join(name), name).expect("writing a file");
-        }
-        std::os::unix::fs::symlink(&outside, run.join("weights.bin")).expect("making a link");
-        fs::create_dir_all(run.join("logs/old")).expect("creating a folder");
-        fs::write(run.join("logs/run-1.log"), "").expect("writing a file");
-        let patterns = ["config.json", "weights.bin", "weights.bin.d", "logs/run-*.log", "outside/*"];
-
-        let remaining = delete(&run, &patterns).expect("deleting the files");
-        assert_eq!(remaining, ["logs", "thesis.tex", "weights.bin", "weights.bin.d"].map(|name| run.join(name)));
-        assert!(!run.join("config.json").exists() && !run.join("logs/run-1.log").exists());
-        assert!(run.join("logs/old").is_dir(), "a folder without a deleted file stays");
-        assert_eq!(fs::read_to_string(&outside).expect("reading the file outside the folder"), "thesis");
-
-        std::os::unix::fs::symlink(&run, root.join("link")).expect("making a link");
-        assert!(delete(&root.join("link"), &["*"]).is_err());
-        assert!(run.join("thesis.tex").exists());
-        fs::remove_dir_all(&root).expect("removing the folder of the test");
-    }
-
-    #[test]
-    fn delete_removes_folders_that_it_empties() {
-        let root = folder("empty");
-        fs::create_dir_all(root.join("a/b")).expect("creating folders");
-        fs::write(root.join("a/b/c.txt"), "").expect("writing a file");
-        assert!(delete(&root, &["a/*/c.txt"]).expect("deleting the files").is_empty());
-        assert!(!root.exists());
-        assert!(delete(&root, &["a"]).expect("deleting in a missing folder").is_empty());
-    }
-
-    #[test]
-    fn reads_regular_files_up_to_the_limit() {
-        let root = folder("read");
-        let path = root.join("file");
-        write(&path, b"four").expect("writing the file");
-        assert_eq!(read(&path, 4).expect("reading the file"), b"four");
-        assert!(read(&path, 3).expect_err("a longer file").to_string().contains("longer than 3 bytes"));
-        assert!(
-            read(Path::new("/dev/zero"), 10).expect_err("reading a device").to_string().contains("not a regular file")
-        );
-        assert!(read(&root, 10).expect_err("reading a folder").to_string().contains("is a folder"));
-        delete_file(&path).expect("deleting the file");
-        fs::remove_dir(&root).expect("removing the empty folder");
-    }
-}
+mod tests;

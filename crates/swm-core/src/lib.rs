@@ -36,6 +36,7 @@ mod parallelism;
 pub mod plan;
 pub mod policy;
 pub mod pool;
+pub mod precision;
 pub mod predictor;
 pub mod registry;
 pub mod requirements;

@@ -11,7 +11,7 @@ Columns come from two sources:
   nested spaces join their keys with `_`;
 * the numeric entries of `info` of a first reset and step: bool, int and float scalars, and arrays of fixed shape.
   An entry that is missing from a later `info` keeps its last value in the episode, and is 0 until it first occurs, so
-  a column never holds a NaN that the environment did not write.
+  a column never holds a NaN that the environment did not write. An entry that both lack has no column: a warning names it.
 
 A name that the engine reserves gets the prefix `obs_` or `info_`; entries that begin with `_` are private.
 """
@@ -56,6 +56,10 @@ RESERVED = frozenset(
 )
 # `info` entries that go into the header.
 IN_HEADER = frozenset(['success', 'is_success'])
+# Among the known entries of `info`, the mark that a warning has named later ones.
+LATE = object()
+# The largest reward: rewards are stored in single precision.
+MOST_REWARD = float(np.finfo(np.float32).max)
 # The time limit of an environment that defines none.
 DEFAULT_STEPS = 1000
 
@@ -109,7 +113,8 @@ def column_dtype(dtype):
 
 
 def store(view, value, name):
-    """Writes a value into a column: of the column's shape, and in an integer column itself, not rounded or wrapped."""
+    """Writes a value into a column: of the column's shape, and of its type. Integers and booleans are neither rounded nor
+    wrapped; floats round to the precision of the column, but not to infinity."""
     value = np.asarray(value)
     # numpy would repeat a value along the axes of the column, parse strings, and drop imaginary parts.
     same = value.size == view.size and (value.size == 1 or value.shape[-view.ndim :] == view.shape)
@@ -117,15 +122,39 @@ def store(view, value, name):
         raise ValueError(f"'{name}' has shape {value.shape}, and its space declares {view.shape}")
     if value.dtype.kind not in 'biuf':
         raise ValueError(f"'{name}' has the type {value.dtype}: return real numbers, as its space declares")
-    if value.dtype != view.dtype and view.dtype.kind != 'f' and not np.can_cast(value.dtype, view.dtype):
-        with np.errstate(invalid='ignore'):
-            exact = value.dtype.kind in 'biuf' and np.array_equal(value.astype(view.dtype), value)
-        if not exact:
-            raise ValueError(
-                f"'{name}' is {value.tolist()} ({value.dtype}), which a column of {view.dtype} cannot hold:"
-                ' return values of the type that its space declares, below 2^63'
-            )
+    if value.dtype != view.dtype:
+        if value.dtype.kind == view.dtype.kind == 'f':
+            view[...] = value.reshape(view.shape)
+            # One value that is not finite makes the sum of squares so.
+            if math.isfinite(np.vdot(view, view)):
+                return
+        value = converted(value, view.dtype, name)
     view[...] = value.reshape(view.shape)
+
+
+def converted(value, dtype, name):
+    """A value in the type of its column. Raises a ValueError if that cannot hold it."""
+    from_kind, to_float = value.dtype.kind, dtype.kind == 'f'
+    # numpy counts 64-bit integers among those that every float64 holds.
+    if not (to_float and from_kind in 'iu') and np.can_cast(value.dtype, dtype):
+        return value
+    with np.errstate(invalid='ignore', over='ignore'):
+        stored = value.astype(dtype)
+        if to_float and from_kind == 'f':
+            fits = np.isfinite(stored)
+        else:
+            # numpy would compare a float with an integer in double precision.
+            fits = (stored.astype(value.dtype) if to_float else stored) == value
+    if np.count_nonzero(fits) == value.size:
+        return stored
+    if to_float and from_kind == 'f':
+        fits |= ~np.isfinite(value)
+    if not fits.all():
+        raise ValueError(
+            f"'{name}' has {value[~fits].flat[0]} ({value.dtype}), which its column of {dtype} cannot hold: return values of"
+            ' the type that its space declares, or in info that of the first reset and step, wide enough for all (at most 64 bits)'
+        )
+    return stored
 
 
 def box(low, high, shape, dtype):
@@ -407,6 +436,8 @@ class Bridge:
                 dtype = column_dtype(np.result_type(*values))
                 name = self.column(names, key, 'info_', dtype, values[0].shape)
                 self.informed.append((key, name, dtype, values[0].shape, self.columns[-1]['offset']))
+        # The entries of `info` that may have a column: later ones are left out. Environments of a world share them in Python.
+        self.known = {key for info in (first, second) for key, value in info.items() if value is not None}
         self.factors_at = self.allocate(8 * sum(len(form['init']) for form, _ in self.factors))
 
         self.no_frame, self.render_shape, self.frame_index = '', None, None
@@ -432,6 +463,10 @@ class Bridge:
                 self.libraries[name.replace('_', '-')] = importlib.metadata.version(name)
             except (importlib.metadata.PackageNotFoundError, ValueError):
                 pass
+
+    def id(self):
+        """The name of the environment in messages."""
+        return getattr(self.env.spec, 'id', self.env)
 
     def allocate(self, size):
         """Reserves the next `size` bytes of the buffer and returns their offset."""
@@ -595,10 +630,9 @@ class Bridge:
                 if dtype.kind == 'f':
                     self.views[name][...] = math.nan
                     shown_now = 'is NaN'
-                warnings.warn(
+                self.warn(
                     f"'{name}' {shown_now} until the first step: the dataset does not say what it is at the goal, and the environment"
-                    ' has no method _get_info() that returns it',
-                    stacklevel=2,
+                    ' has no method _get_info() that returns it'
                 )
         shown, self.held = ([(self.views[name], argument(value)) for name, value in part.items()] for part in (shown, held))
         for view, value in [*shown, *self.held]:
@@ -646,7 +680,29 @@ class Bridge:
         """Takes the action in the buffer."""
         self.write(*self.call(self.env.step, self.actions.read(self.action)))
 
+    def warn(self, text):
+        """Warns of what the environment does. A worker process replaces this, and sends the text to its parent."""
+        warnings.warn(text, stacklevel=3)
+
+    def warn_of_late(self, info):
+        """Warns, once, of entries of `info` that have no column because the first reset and step had none of the name."""
+        late = [
+            key
+            for key, value in info.items()
+            if isinstance(key, str) and key not in self.known and key[:1] != '_' and key not in IN_HEADER
+            if numeric(value) is not None
+        ]
+        if late:
+            self.known.add(LATE)
+            names = ', '.join(map(repr, late[:5])) + f' and {len(late) - 5} more' * (len(late) > 5)
+            self.warn(
+                f"{self.id()}: {names} in info: not in the info of the first reset and step, so left out; return it there as"
+                ' well, with 0 for no value (further ones are not named)'
+            )
+
     def write(self, observation, reward, terminated, truncated, info):
+        if not info.keys() <= self.known and LATE not in self.known:
+            self.warn_of_late(info)
         for path, view in self.observed_views:
             value = observation
             for key in path:
@@ -666,8 +722,13 @@ class Bridge:
         for view, value in self.held:
             view[...] = np.reshape(value, view.shape)
         terminated, truncated = flag(terminated, 'terminated'), flag(truncated, 'truncated')
-        if not isinstance(reward, (float, int, np.floating)):
-            reward = number(reward)
+        if not isinstance(reward, (float, int)):
+            reward = float(reward) if isinstance(reward, np.floating) else number(reward)
+        if abs(reward) > MOST_REWARD and abs(reward) != math.inf:
+            raise ValueError(
+                f'the reward of {self.id()} is {reward}: rewards are stored in single precision, which'
+                f' ends at {MOST_REWARD:.1e}; scale it, for example with gymnasium.wrappers.TransformReward'
+            )
         key = 'success' if 'success' in info else 'is_success'
         value = info.get(key)
         if value is None and key in info and self.states_success and (terminated or truncated):
@@ -749,5 +810,13 @@ def make(id, options, wrappers=()):
             raise
         env = gymnasium.make(spec, **settings)
     for wrap in wrappers:
-        env = wrap(env)
+        try:
+            env = wrap(env)
+        except ValueError as error:
+            if 'TimeLimit' not in str(error):
+                raise
+            raise ValueError(
+                f'{error} The engine enforces the time limit, so environments have no TimeLimit here: give the wrapper one,'
+                ' as in lambda env: TimeAwareObservation(TimeLimit(env, 100)) with the time limit of the World'
+            ) from error
     return Bridge(env, limit)

@@ -120,19 +120,23 @@ def make(connection, memory):
 
 
 def handle_requests(connection, bridge):
-    """Handles requests until the parent closes the connection."""
+    """Handles requests until the parent closes the connection. The text of an answer that a request is done is the warnings,
+    one a line."""
     from swm_bridge import InvalidRequest
 
+    noted = []
+    bridge.warn = noted.append
     while True:
         op, payload = connection.request()
         try:
+            noted.clear()
             bridge.handle(op, payload)
         except InvalidRequest as error:
             connection.answer(INVALID, json.dumps(error.args))
         except BaseException:  # Including `sys.exit()`.
             connection.answer(RAISED, traceback.format_exc())
         else:
-            connection.answer(DONE)
+            connection.answer(DONE, '\n'.join(noted))
 
 
 def serve():

@@ -7,6 +7,7 @@
 //!
 //! `docs/gymnasium.md` documents how observations, `info`, factors of variation, goals and frames are mapped.
 
+mod answer;
 pub mod assets;
 mod choose;
 mod config;
@@ -18,6 +19,7 @@ mod finite;
 mod id;
 mod interned;
 mod reset_arguments;
+mod tail;
 mod transport;
 mod worker;
 

@@ -6,34 +6,28 @@
 //! socket closes, and, on Linux, when this process ends in any way.
 
 use crate::config::{GymConfig, Python};
-use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, TrustedId, WORKER, assets};
+use crate::tail::Tail;
+use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, TrustedId, WORKER, answer, assets};
 use memmap2::{MmapMut, MmapOptions};
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
-use std::process::{Child, ChildStderr, Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::mpsc::{Sender, SyncSender, channel, sync_channel};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 use swm_core::{Error, limits};
 
-/// The number of last lines of a worker's standard error in error messages.
-const LINES: usize = 20;
-/// The kinds of answers: done; an exception; an unknown id; a missing package; unsupported; an invalid request.
+/// The kinds of answers: done, with warnings; an exception; an unknown id; a missing package; unsupported; an invalid request.
 const ANSWERS: &[u8] = b".xumfw";
 /// The maximum length of an answer: a description of an environment, or a traceback.
 const MAX_ANSWER: usize = 64 << 20;
-/// The maximum length of a line of a worker's standard error; the rest of a longer line counts as another line.
-const MAX_LINE: u64 = 4096;
 /// The time that a worker process gets to end by itself.
-const EXIT_TIMEOUT: Duration = Duration::from_millis(500);
-
-/// How long a start may take until a message says what it waits for.
-const SLOW_START: Duration = Duration::from_secs(10);
+pub(crate) const EXIT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A Python process with one environment.
 pub struct WorkerTransport {
@@ -49,8 +43,8 @@ struct Process {
     memory: Option<MmapMut>,
     /// Whether the answer to a sent request is not read yet. Meanwhile only the worker accesses the memory.
     pending: bool,
-    /// The first byte of an answer whose rest is not read yet.
-    begun: Option<u8>,
+    /// Whether a call that takes long was reported.
+    is_reported: bool,
     tail: Tail,
     _counted: Counted,
 }
@@ -127,7 +121,8 @@ impl WorkerTransport {
     fn exchange(&mut self, op: u8, payload: &[u8], limit: Duration) -> Result<(u8, Vec<u8>), Failure> {
         let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
         let sent = if std::mem::take(&mut process.pending) { Ok(()) } else { process.send(op, payload) };
-        sent.and_then(|()| process.receive()).map_err(|problem| self.lose(&problem, limit))
+        let answered = sent.and_then(|()| process.wait_for_call(self.id.id(), op, limit));
+        answered.and_then(|head| process.receive(head, limit)).map_err(|problem| self.lose(&problem, limit))
     }
 
     /// Converts an answer that reports a failure into a [`Failure`].
@@ -181,7 +176,7 @@ impl Transport for WorkerTransport {
     fn describe(&mut self) -> Result<Description, Failure> {
         let limit = self.config.start_timeout;
         let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
-        let answer = process.wait_to_start(self.id.id(), limit).and_then(|()| process.receive());
+        let answer = process.wait_to_start(self.id.id(), limit).and_then(|head| process.receive(head, limit));
         let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
             // A new worker would exceed the same timeout.
             Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
@@ -214,7 +209,10 @@ impl Transport for WorkerTransport {
 
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure> {
         match self.exchange(request.op(), request.payload(), self.config.call_timeout)? {
-            (b'.', _) => Ok(()),
+            (b'.', warnings) => {
+                warn(&String::from_utf8_lossy(&warnings));
+                Ok(())
+            }
             (kind, text) => Err(self.failure(kind, text)),
         }
     }
@@ -267,7 +265,7 @@ impl Process {
             Error::config("Python", format!("{python} cannot be started: {error}"), python.fix("gymnasium"))
         })?;
         let tail = Tail::of(child.stderr.take(), id);
-        Ok(Self { child, socket, file, memory: None, pending: false, begun: None, tail, _counted: counted })
+        Ok(Self { child, socket, file, memory: None, pending: false, is_reported: false, tail, _counted: counted })
     }
 
     fn send(&mut self, op: u8, payload: &[u8]) -> std::io::Result<()> {
@@ -279,34 +277,37 @@ impl Process {
         if payload.is_empty() { Ok(()) } else { self.socket.write_all(payload) }
     }
 
-    /// Waits until the first answer begins. Says after [`SLOW_START`] what it waits for.
-    fn wait_to_start(&mut self, id: &str, limit: Duration) -> std::io::Result<()> {
-        let mut kind = [0];
-        self.socket.set_read_timeout(Some(SLOW_START.min(limit)))?;
-        let mut answer = self.socket.read_exact(&mut kind);
-        if answer.as_ref().is_err_and(|error| error.kind() == std::io::ErrorKind::WouldBlock) && limit > SLOW_START {
+    /// Waits until the first answer begins. A message names after a while what it waits for.
+    fn wait_to_start(&mut self, id: &str, limit: Duration) -> std::io::Result<answer::Head> {
+        answer::prepare(&self.socket, limit)?;
+        let report = || {
             tracing::warn!(
                 "{id} is still being made (imports, compilation, a first reset and step); after {} s it is given up \
                  ($SWM_GYM_START_TIMEOUT changes this)",
                 limit.as_secs()
             );
-            self.socket.set_read_timeout(Some(limit.saturating_sub(SLOW_START)))?;
-            answer = self.socket.read_exact(&mut kind);
-        }
-        answer?;
-        self.begun = Some(kind[0]);
-        Ok(())
+        };
+        answer::head(&mut self.socket, limit, report)
     }
 
-    fn receive(&mut self) -> std::io::Result<(u8, Vec<u8>)> {
-        let mut head = [0; 5];
-        match self.begun.take() {
-            Some(kind) => {
-                head[0] = kind;
-                self.socket.read_exact(&mut head[1..])?;
+    /// Waits until the answer to a call begins. A message names after a while, once for each process, what it waits for.
+    fn wait_for_call(&mut self, id: &str, op: u8, limit: Duration) -> std::io::Result<answer::Head> {
+        let (worker, is_reported) = (self.child.id(), &mut self.is_reported);
+        let report = || {
+            if !std::mem::replace(is_reported, true) {
+                let what = what_is_called(op);
+                tracing::warn!(
+                    "{id} has not answered its {what} yet (worker process {worker}); after {} s it is given up \
+                     ($SWM_GYM_TIMEOUT changes this)",
+                    limit.as_secs()
+                );
             }
-            None => self.socket.read_exact(&mut head)?,
-        }
+        };
+        answer::head(&mut self.socket, limit, report)
+    }
+
+    /// Receives the text of an answer with this head; it may take `limit`.
+    fn receive(&mut self, head: answer::Head, limit: Duration) -> std::io::Result<(u8, Vec<u8>)> {
         let [kind, n @ ..] = head;
         let n = u32::from_le_bytes(n) as usize;
         if !ANSWERS.contains(&kind) {
@@ -318,14 +319,18 @@ impl Process {
         }
         // Most answers are empty, and an empty vector allocates nothing.
         let mut text = vec![0; n];
-        self.socket.read_exact(&mut text)?;
+        if n > 0 {
+            self.socket.set_read_timeout(Some(limit))?;
+            self.socket.read_exact(&mut text)?;
+            answer::prepare(&self.socket, limit)?;
+        }
         Ok((kind, text))
     }
 
     /// Maps the memory that the worker allocated.
-    fn open(&mut self, size: usize, answer: Duration) -> std::io::Result<()> {
-        self.socket.set_read_timeout(Some(answer))?;
-        self.socket.set_write_timeout(Some(answer))?;
+    fn open(&mut self, size: usize, limit: Duration) -> std::io::Result<()> {
+        answer::prepare(&self.socket, limit)?;
+        self.socket.set_write_timeout(Some(limit))?;
         seal(&self.file)?;
         let allocated = self.file.metadata()?.len();
         if allocated < size as u64 {
@@ -368,6 +373,31 @@ impl Drop for Process {
     }
 }
 
+/// The most different warnings of workers.
+const MOST_WARNINGS: usize = 1000;
+
+/// Warns of each line that a worker reports, once for all workers.
+fn warn(lines: &str) {
+    static REPORTED: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
+    for line in lines.lines() {
+        let mut reported = REPORTED.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_new = reported.len() < MOST_WARNINGS && reported.insert(line.to_owned());
+        drop(reported);
+        if is_new {
+            tracing::warn!("{line}");
+        }
+    }
+}
+
+/// The name of a call, for messages.
+fn what_is_called(op: u8) -> &'static str {
+    match op {
+        b'r' => "reset",
+        b'p' => "rendering",
+        _ => "step",
+    }
+}
+
 /// The error of a worker that violates the protocol.
 fn violation(problem: String) -> std::io::Error {
     std::io::Error::new(std::io::ErrorKind::InvalidData, problem)
@@ -407,50 +437,6 @@ fn map(file: &File, size: usize) -> std::io::Result<MmapMut> {
     // calls the transport returns no reference to the memory. A worker that does not answer in time is killed before the
     // memory is accessed again.
     unsafe { MmapOptions::new().len(size).map_mut(file) }
-}
-
-/// The last lines of a worker's standard error.
-struct Tail {
-    lines: Arc<Mutex<VecDeque<String>>>,
-    /// Disconnected when the pipe closes.
-    closed: Receiver<()>,
-}
-
-impl Tail {
-    fn of(pipe: Option<ChildStderr>, id: &str) -> Self {
-        let lines = Arc::new(Mutex::new(VecDeque::new()));
-        let (last, id) = (Arc::clone(&lines), id.to_owned());
-        let (open, closed) = channel();
-        let read = move || {
-            let _dropped_at_the_end: Sender<()> = open;
-            let mut pipe = pipe.map(BufReader::new);
-            let mut line = vec![];
-            while let Some(pipe) = &mut pipe
-                && let Ok(1..) = pipe.take(MAX_LINE).read_until(b'\n', &mut line)
-            {
-                let text = String::from_utf8_lossy(&line).trim_end().to_owned();
-                tracing::debug!("{id}: {text}");
-                let mut last = last.lock().unwrap_or_else(PoisonError::into_inner);
-                if last.len() == LINES {
-                    last.pop_front();
-                }
-                last.push_back(text);
-                line.clear();
-            }
-        };
-        // Without this thread, error messages lack the worker's last output.
-        if let Err(problem) = std::thread::Builder::new().name("swm-gym-stderr".to_owned()).spawn(read) {
-            tracing::debug!("collecting the output of a worker: {problem}");
-        }
-        Self { lines, closed }
-    }
-
-    /// Waits until the pipe closes, for at most [`EXIT_TIMEOUT`], and returns the last lines.
-    fn lines(&self) -> Vec<String> {
-        // A child of the worker may hold the pipe open, so the wait is bounded.
-        let _closed_or_timed_out = self.closed.recv_timeout(EXIT_TIMEOUT);
-        self.lines.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
-    }
 }
 
 /// A command and the channel that receives its child.

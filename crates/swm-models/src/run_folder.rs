@@ -132,5 +132,13 @@ pub fn remove(run: &Path) -> Result<Vec<PathBuf>> {
     if failed_batch::is_own(&failed) {
         files::delete_named(run, &[failed_batch::FILE.into()])?;
     }
-    files::delete(run, &patterns.iter().map(String::as_str).collect::<Vec<_>>())
+    let mut remaining = files::delete(run, &patterns.iter().map(String::as_str).collect::<Vec<_>>())?;
+    // A kill right after the folder of a checkpoint was made leaves it empty.
+    let new = run.join(NEW_FOLDER);
+    if remaining.contains(&new) {
+        files::remove_empty_folder(&new)?;
+        remaining.retain(|path| *path != new || path.exists());
+        files::remove_empty_folder(run)?;
+    }
+    Ok(remaining)
 }

@@ -1,10 +1,10 @@
 //! [`store`]: writes checkpoints that another program trained.
 
-use crate::checkpoint::{check_unused, write};
+use crate::checkpoint::write;
 use crate::nn::parameters::{HostTensor, Named};
 use crate::registry::{FAMILIES, load_stored};
 use crate::run_folder::{OPTIMIZER, RAW, STATE};
-use crate::stored::{StoredCheckpoint, check_replaceable};
+use crate::stored::{StoredCheckpoint, check_replaceable, write_unused};
 use crate::tensor_file;
 use crate::train::run_state::RunState;
 use burn::tensor::Device;
@@ -35,11 +35,12 @@ pub struct StateParts {
 }
 
 /// Writes a checkpoint that another program trained to the run folder `run`, and returns the hash of its weights. Replaces
-/// a checkpoint only if `replace` is set.
+/// a checkpoint only if `replace` is set: the caller, such as a training, then keeps other writers away.
 ///
 /// # Errors
-/// When the parts are not those of a checkpoint that this program can load, as [`check_unused`] without `replace`, when what would be
-/// replaced is no checkpoint of this program, or when writing fails; an earlier checkpoint is kept.
+/// When the parts are not those of a checkpoint that this program can load; without `replace`, when the folder holds one or another
+/// process writes to it; when what would be replaced is no checkpoint of this program; or when writing fails. An earlier
+/// checkpoint is kept.
 pub fn store(run: &Path, parts: Parts, replace: bool) -> Result<String> {
     let Parts { file, mut manifest, weights, state } = parts;
     let invalid = |problem: String| {
@@ -50,11 +51,6 @@ pub fn store(run: &Path, parts: Parts, replace: bool) -> Result<String> {
     }
     let stored = StoredCheckpoint::of_parts(run, file.clone(), manifest.clone(), weights.clone());
     load_stored(FAMILIES.rows, &stored, &Device::flex())?;
-    if replace {
-        check_replaceable(run)?;
-    } else {
-        check_unused(run)?;
-    }
     let mut additional = vec![];
     manifest.hashes.retain(|name, _| !["optimizer", "raw"].contains(&name.as_str()));
     if let Some(StateParts { state, moments, raw }) = state {
@@ -69,8 +65,13 @@ pub fn store(run: &Path, parts: Parts, replace: bool) -> Result<String> {
             additional.push((RAW, raw));
         }
     }
+    let mut write = || write(run, &file, &mut manifest, &weights, &additional);
+    if !replace {
+        return write_unused(run, write);
+    }
+    check_replaceable(run)?;
     std::fs::create_dir_all(run).map_err(|error| Error::io(run, "creating a folder", error))?;
-    write(run, &file, &mut manifest, &weights, &additional)
+    write()
 }
 
 fn state_text(state: &RunState) -> Result<Vec<u8>> {

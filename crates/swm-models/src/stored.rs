@@ -14,7 +14,8 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Manifest, Result, files, manifest};
+use swm_core::files::{self, Lock};
+use swm_core::{Error, Manifest, Result, manifest};
 
 /// The parts of a checkpoint of any family.
 #[derive(Clone, Debug)]
@@ -195,20 +196,38 @@ impl StoredCheckpoint {
         Ok(model)
     }
 
-    /// Checks the hash of `config.json` if the manifest has one: statistics of the data and settings of the frames change what
-    /// a model computes without changing its weights.
+    /// Checks the hash of `config.json` if the manifest has one, and that the manifest of a training repeats its settings:
+    /// statistics of the data and settings of the frames change what a model computes without changing its weights. A capsule
+    /// is checked where it is read.
     fn check_config(&self) -> Result<()> {
-        match (&self.config_hash, self.manifest.hashes.get("config")) {
-            (Some(found), Some(expected)) if found != expected => {
-                Err(self.broken(format!("is not the file that {MANIFEST} describes: the hash differs")))
-            }
-            _ => Ok(()),
+        let Some(found) = &self.config_hash else { return Ok(()) };
+        if self.manifest.hashes.get("config").is_some_and(|expected| expected != found) {
+            return Err(self.broken(format!("is not the file that {MANIFEST} describes: the hash differs")));
+        }
+        let shown = &self.manifest.config;
+        let contradiction = (self.manifest.kind == "train").then(|| contradiction("", shown, &self.file["config"]));
+        match contradiction.flatten() {
+            Some(key) => Err(self.broken(format!("states another value of '{key}' than the config in {MANIFEST}"))),
+            None => Ok(()),
         }
     }
 
     /// Returns the error for damage in the configuration.
     pub(crate) fn broken(&self, problem: String) -> Error {
         broken(&self.path, problem)
+    }
+}
+
+/// Returns the dotted key of a setting that two configurations state differently. Settings that one of them lacks may have been
+/// added since it was written.
+fn contradiction(at: &str, left: &Value, right: &Value) -> Option<String> {
+    match (left, right) {
+        (Value::Null, _) | (_, Value::Null) => None,
+        (Value::Object(left), Value::Object(right)) => left.iter().find_map(|(key, value)| {
+            let at = if at.is_empty() { key.clone() } else { format!("{at}.{key}") };
+            contradiction(&at, value, right.get(key)?)
+        }),
+        _ => (left != right).then(|| at.to_owned()),
     }
 }
 
@@ -222,9 +241,25 @@ pub fn family(run: &Path) -> Option<String> {
 }
 
 /// Returns whether a run folder has no checkpoint but the beginning of one, which a killed program leaves. The
-/// configuration is written first.
+/// configuration is written first; before it is there, the folder has its temporary files at most.
 pub fn is_unfinished(run: &Path) -> bool {
-    locate(run).is_none() && is_begun(&run.join(NEW_FOLDER))
+    let new = run.join(NEW_FOLDER);
+    locate(run).is_none() && (is_begun(&new) || is_created(&new))
+}
+
+/// Returns whether a folder is empty, or holds only what a kill leaves of writing the configuration of a checkpoint.
+fn is_created(folder: &Path) -> bool {
+    let is_temporary = |name: &str| {
+        let process = name.strip_prefix('.').and_then(|name| name.strip_prefix(CONFIG)?.strip_prefix('.'));
+        process.and_then(|process| process.strip_suffix(".tmp")).is_some_and(|process| process.parse::<u32>().is_ok())
+    };
+    let is_own = |entry: std::io::Result<std::fs::DirEntry>| {
+        entry.is_ok_and(|entry| {
+            entry.file_type().is_ok_and(|kind| kind.is_file()) && entry.file_name().to_str().is_some_and(is_temporary)
+        })
+    };
+    let is_folder = std::fs::symlink_metadata(folder).is_ok_and(|found| found.is_dir());
+    is_folder && std::fs::read_dir(folder).is_ok_and(|mut entries| entries.all(is_own))
 }
 
 /// Returns whether a folder has the configuration of a checkpoint, which is written first.
@@ -257,6 +292,23 @@ pub fn check_unused(run: &Path) -> Result<()> {
     let problem = format!("holds a checkpoint already, or files with such names: '{name}' exists");
     let fix = "choose another folder, or `swm checkpoints remove` a checkpoint";
     Err(Error::config(run.display().to_string(), problem, fix))
+}
+
+/// Writes a checkpoint to a run folder that holds none, and keeps other writers away meanwhile. If `write` fails, a folder that it
+/// leaves empty is removed.
+///
+/// # Errors
+/// As [`check_unused`], when another process writes to `run`, and when `write` fails.
+pub(crate) fn write_unused(run: &Path, write: impl FnOnce() -> Result<String>) -> Result<String> {
+    let existed = run.is_dir();
+    let _lock = Lock::folder(run)?;
+    check_unused(run)?;
+    let written = write();
+    if written.is_err() && !existed {
+        // The error of writing says more.
+        let _ = files::remove_empty_folder(run);
+    }
+    written
 }
 
 /// Checks that a folder that a checkpoint replaces has files of a checkpoint only beside the configuration of one.

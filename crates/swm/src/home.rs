@@ -5,7 +5,7 @@ use crate::{remote_checkpoint, zoo};
 use std::iter::once;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
-use swm_core::run::Control;
+use swm_core::run::{Control, Event};
 use swm_core::{Error, Result};
 use swm_data::hub::{Hub, HubUri, RepoKind, check_no_pointer};
 use swm_data::{FORMATS, Location, Reader};
@@ -67,6 +67,15 @@ pub fn show_downloads(make: impl Fn() -> Control<'static> + Send + Sync + 'stati
     let _ = DOWNLOADS.set(Box::new(make));
 }
 
+/// Returns the control of downloads for a program that shows none: messages are logged.
+fn logging() -> Control<'static> {
+    Control::new().with_events(|event| {
+        if let Event::Log(line) = event {
+            tracing::warn!("{line}");
+        }
+    })
+}
+
 /// Returns the URIs of the hub that this process has read, with their commits.
 pub fn pinned_uris() -> Vec<String> {
     PINNED.lock().unwrap_or_else(PoisonError::into_inner).clone()
@@ -75,7 +84,7 @@ pub fn pinned_uris() -> Vec<String> {
 /// Downloads what a URI of the hub names, if it is not cached; returns its path and the URI with its commit.
 fn pull(given: &str, kind: RepoKind) -> Result<(PathBuf, String)> {
     let uri = HubUri::parse(given, kind)?;
-    let mut control = DOWNLOADS.get().map_or_else(Control::new, |make| make());
+    let mut control = DOWNLOADS.get().map_or_else(logging, |make| make());
     let pulled = Hub::new(&hub_cache()?)?.pull(&uri, &mut control)?;
     let mut pinned = PINNED.lock().unwrap_or_else(PoisonError::into_inner);
     if !pinned.contains(&pulled.pinned) {

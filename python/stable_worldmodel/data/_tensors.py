@@ -11,6 +11,8 @@ from typing import Any, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
+from stable_worldmodel import _options
+
 Array = npt.NDArray[Any]
 Backend = Literal["torch", "numpy"]
 
@@ -124,7 +126,7 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
             continue
         text = _text(name, value)
         if text is not None:
-            constants[name] = text
+            constants[name] = _options.valid_text(f"column {name!r}", text) if isinstance(text, str) else text
             continue
         if np.ma.is_masked(value):
             raise ValueError(f"column {name!r}: it has masked values, which datasets cannot leave out; fill them with `filled`")

@@ -44,6 +44,10 @@ class _Content(Dataset):
         return [name for name, _, _ in self._columns]
 
     @property
+    def _row_shapes(self) -> dict[str, tuple[int, ...]]:
+        return {name: tuple(shape) for name, _, shape in self._columns}
+
+    @property
     def engine(self) -> Any:
         if self._snapshot is None:
             raise RuntimeError("the replay buffer is empty: write an episode first")
@@ -70,12 +74,9 @@ class _Content(Dataset):
         return dict(self.engine.read(self.column_names, *run, skip))
 
     def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
-        if not 0 <= ep_idx < self.num_episodes or not 0 <= start <= end <= self.lengths[ep_idx]:
-            raise IndexError(
-                f"rows {start} .. {end} of episode {ep_idx} are outside the replay buffer of {self.num_episodes} episodes"
-            )
-        episodes, starts, lengths = (np.asarray([value]) for value in (ep_idx, start, end - start))
-        sample: dict[str, Any] = self._read(episodes, starts, lengths, self.frameskip)
+        episodes, starts, ends = (np.asarray([value]) for value in (ep_idx, start, end))
+        episodes = self._counted(episodes, starts, ends)
+        sample: dict[str, Any] = self._read(episodes, starts, ends - starts, self.frameskip)
         return self.transform(sample) if self.transform else sample
 
     def _episode_values(self, episode: int) -> dict[str, Any]:
@@ -91,9 +92,8 @@ class _Content(Dataset):
         return np.asarray(found[col])
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
-        rows = np.atleast_1d(_tensors.whole("row_idx", row_idx))
-        episodes = np.searchsorted(self.offsets, rows, side="right") - 1
-        found = self._read(episodes, rows - self.offsets[episodes], np.ones_like(rows), 1)
+        episodes, starts = self._rows(row_idx)
+        found = self._read(episodes, starts, np.ones_like(starts), 1)
         return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
 
     def episodes(self) -> Iterator[dict[str, Any]]:
@@ -251,6 +251,10 @@ class ReplayBuffer(Dataset):
     def engine(self) -> Any:
         """The engine's dataset of the current content."""
         return self._now.engine
+
+    @property
+    def _row_shapes(self) -> dict[str, tuple[int, ...]]:
+        return self._now._row_shapes
 
     @property
     def num_steps_stored(self) -> int:

@@ -58,16 +58,33 @@ class Dataset:
         self.frameskip = _options.count("frameskip", frameskip)
         self.num_steps = _options.count("num_steps", num_steps)
         self.lengths, self.offsets = (np.array(rows, dtype=np.int64) for rows in (lengths, offsets))
+        self._protect()
         self.span = self.num_steps * self.frameskip
         self.transform = transform
         clips = np.maximum(self.lengths - self.span + 1, 0)
         #: The number of clips before every episode, and at the end the number of all clips.
         self._clips_before = np.concatenate([[0], np.cumsum(clips)]).astype(np.int64)
 
+    def _protect(self) -> None:
+        """Makes lengths and offsets read-only: what is written there would not change the episodes."""
+        for rows in (getattr(self, name, None) for name in ("lengths", "offsets")):
+            if isinstance(rows, np.ndarray):
+                rows.setflags(write=False)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        # Pickles do not keep the flag.
+        self._protect()
+
     @property
     def column_names(self) -> list[str]:
         """The columns of a sample."""
         raise NotImplementedError(f"{type(self).__name__}.column_names")
+
+    @property
+    def _row_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of a row of the columns, as far as they are known."""
+        return {}
 
     def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
         """The rows `start .. end` of an episode: all rows of `action`, every `frameskip`-th row of other columns.
@@ -146,7 +163,9 @@ class Dataset:
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
         """A whole episode: all rows of `action`, every `frameskip`-th row of other columns."""
-        return self._load_slice(episode_idx, 0, int(self.lengths[episode_idx]))
+        none = np.zeros(1, np.int64)
+        episode = int(self._counted(_tensors.whole("episode_idx", [episode_idx]), none, none)[0])
+        return self._load_slice(episode, 0, int(self.lengths[episode]))
 
     def get_col_data(self, col: str) -> Array:
         """All rows of a column, `(rows, ...)`; images `(rows, H, W, C)`."""
@@ -155,6 +174,17 @@ class Dataset:
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
         """The rows with these indices in the whole dataset: `(...)` for one index, `(rows, ...)` for several."""
         raise NotImplementedError(f"{type(self).__name__}.get_row_data")
+
+    def _rows(self, row_idx: Rows) -> tuple[Array, Array]:
+        """The episodes of rows of the whole dataset, and the rows in them; negative rows count from the last one."""
+        rows = np.atleast_1d(_tensors.whole("row_idx", row_idx))
+        total = int(self.lengths.sum())
+        if ((rows < -total) | (rows >= total)).any():
+            raise IndexError(f"some of the rows {rows.tolist()} are outside the dataset, which has {total} rows")
+        rows = np.where(rows < 0, rows + total, rows)
+        # An episode without rows has the offset of the next episode; `side="right"` selects the later of the two.
+        episodes = np.searchsorted(self.offsets, rows, side="right") - 1
+        return episodes, rows - self.offsets[episodes]
 
     @property
     def episode_column_names(self) -> list[str]:
@@ -333,6 +363,11 @@ class StoredDataset(Dataset):
             raise IndexError(f"episode {episode} is outside the dataset, which has {self.num_episodes} episodes")
         return _tensors.episode_values(self._stored.constants(wanted).get(_tensors.EPISODE))
 
+    @property
+    def _row_shapes(self) -> dict[str, tuple[int, ...]]:
+        merged, schema = self._merged, self.schema
+        return {name: merged[name].shape[1:] if name in merged else schema[name][1] for name in self._keys}
+
     def _row_shape(self, name: str) -> tuple[int, ...]:
         return self._merged[name].shape[1:] if name in self._merged else self.schema[name][1]
 
@@ -403,14 +438,8 @@ class StoredDataset(Dataset):
         return self._read([col], all_episodes, np.zeros_like(all_episodes), self.lengths, 1)[col]
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
-        rows = np.atleast_1d(_tensors.whole("row_idx", row_idx))
-        total = int(self.lengths.sum())
-        if ((rows < -total) | (rows >= total)).any():
-            raise IndexError(f"some of the rows {rows.tolist()} are outside the dataset, which has {total} rows")
-        rows = np.where(rows < 0, rows + total, rows)
-        episodes = np.searchsorted(self.offsets, rows, side="right") - 1
-        # An episode without rows has the offset of the next episode; `side="right"` selects the later of the two.
-        found = self._read(self._keys, episodes, rows - self.offsets[episodes], np.ones_like(rows), 1)
+        episodes, starts = self._rows(row_idx)
+        found = self._read(self._keys, episodes, starts, np.ones_like(starts), 1)
         return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
 
     def get_dim(self, col: str) -> int:
@@ -516,6 +545,11 @@ class MergeDataset:
         return [name for keys in self.keys_map for name in keys]
 
     @property
+    def _row_shapes(self) -> dict[str, tuple[int, ...]]:
+        pairs = zip(map(_row_shapes, self.datasets), self.keys_map, strict=True)
+        return {name: shapes[name] for shapes, keys in pairs for name in keys if name in shapes}
+
+    @property
     def lengths(self) -> Array:
         """The number of rows of every episode."""
         return np.asarray(self.datasets[0].lengths)
@@ -592,7 +626,10 @@ class MergeDataset:
 
 
 class ConcatDataset:
-    """The episodes of several datasets, one after another."""
+    """The episodes of several datasets, one after another.
+
+    A column that has scalars in some datasets and lists of one element in others, as those from Lance, has scalars.
+    """
 
     def __init__(self, datasets: Sequence[Any]) -> None:
         if not datasets:
@@ -601,6 +638,11 @@ class ConcatDataset:
         _check_same_clips("ConcatDataset", self.datasets)
 
     # Counted at every call, because a `ReplayBuffer` grows.
+
+    @property
+    def _now(self) -> ConcatDataset:
+        """The dataset with the present content of its replay buffers, which other threads may clear."""
+        return at_this_moment(self, None)  # type: ignore[no-any-return]
 
     @property
     def _clips_before(self) -> Array:
@@ -618,6 +660,39 @@ class ConcatDataset:
     def column_names(self) -> list[str]:
         """The columns that at least one of the datasets has."""
         return list(dict.fromkeys(name for dataset in self.datasets for name in dataset.column_names))
+
+    @property
+    def _row_shapes(self) -> dict[str, tuple[int, ...]]:
+        shapes = [_row_shapes(dataset) for dataset in self.datasets]
+        return {
+            name: min((of[name] for of in shapes if name in of), key=len) for name in {name for of in shapes for name in of}
+        }
+
+    def _alike(self, items: list[dict[str, Any]], axes: int = 1, *, are_grouped: bool = False) -> list[dict[str, Any]]:
+        """Items of the datasets with scalars in columns that have scalars in some datasets and lists of one element in others.
+
+        Args:
+            items: Samples, episodes or rows.
+            axes: The number of axes of scalars in an item.
+            are_grouped: Whether actions are grouped by step, which gives them one shape.
+        """
+        shapes: dict[str, tuple[int, ...]] = {}
+        mixed = set()
+        for dataset in self.datasets:
+            for name, shape in _row_shapes(dataset).items():
+                other = shapes.setdefault(name, shape)
+                if other != shape and {other, shape} == {(), (1,)}:
+                    mixed.add(name)
+        if are_grouped:
+            mixed.discard("action")
+        if not mixed:
+            return items
+
+        def scalars(name: str, value: Any) -> Any:
+            is_list = name in mixed and getattr(value, "ndim", axes) == axes + 1 and value.shape[-1] == 1
+            return value[..., 0] if is_list else value
+
+        return [{name: scalars(name, value) for name, value in item.items()} for item in items]
 
     @property
     def lengths(self) -> Array:
@@ -670,16 +745,20 @@ class ConcatDataset:
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
         """The samples of a batch."""
-        parts, indices_in_part = self._locate(self._clips_before, indices, "clips")
-        return self._gathered(parts, lambda part, mask: _items(self.datasets[part], indices_in_part[mask].tolist()))
+        now = self._now
+        parts, indices_in_part = self._locate(now._clips_before, indices, "clips")
+        found = self._gathered(parts, lambda part, mask: _items(now.datasets[part], indices_in_part[mask].tolist()))
+        return now._alike(found, are_grouped=True)
 
     def load_chunk(self, episodes_idx: Any, start: Any, end: Any) -> list[dict[str, Any]]:
         """See :meth:`Dataset.load_chunk`."""
+        now = self._now
         episodes, starts, ends = _runs(episodes_idx, start, end)
-        parts, episodes = self._locate(self._episodes_before, episodes, "episodes")
-        return self._gathered(
-            parts, lambda part, mask: self.datasets[part].load_chunk(episodes[mask], starts[mask], ends[mask])
+        parts, episodes = self._locate(now._episodes_before, episodes, "episodes")
+        found = self._gathered(
+            parts, lambda part, mask: now.datasets[part].load_chunk(episodes[mask], starts[mask], ends[mask])
         )
+        return now._alike(found, are_grouped=True)
 
     @staticmethod
     def _gathered(parts: Array, load: Callable[[int, Array], list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -691,17 +770,20 @@ class ConcatDataset:
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
         """See :meth:`Dataset.load_episode`."""
-        parts, episodes = self._locate(self._episodes_before, [episode_idx], "episodes")
-        return dict(self.datasets[int(parts[0])].load_episode(int(episodes[0])))
+        now = self._now
+        parts, episodes = self._locate(now._episodes_before, [episode_idx], "episodes")
+        return now._alike([dict(now.datasets[int(parts[0])].load_episode(int(episodes[0])))])[0]
 
     def _load_slice(self, episode: int, start: int, end: int) -> dict[str, Any]:
-        parts, episodes = self._locate(self._episodes_before, [episode], "episodes")
-        return dict(self.datasets[int(parts[0])]._load_slice(int(episodes[0]), start, end))
+        now = self._now
+        parts, episodes = self._locate(now._episodes_before, [episode], "episodes")
+        return now._alike([dict(now.datasets[int(parts[0])]._load_slice(int(episodes[0]), start, end))])[0]
 
     @property
     def clip_indices(self) -> list[tuple[int, int]]:
         """The episode and the first row of every clip."""
-        pairs = zip(self._episodes_before.tolist(), self.datasets, strict=False)
+        now = self._now
+        pairs = zip(now._episodes_before.tolist(), now.datasets, strict=False)
         return [(before + episode, start) for before, dataset in pairs for episode, start in dataset.clip_indices]
 
     @property
@@ -712,9 +794,10 @@ class ConcatDataset:
 
     def get_episode_data(self, episodes_idx: Any = None) -> dict[str, Array]:
         """See :meth:`Dataset.get_episode_data`."""
-        wanted = np.arange(self.num_episodes) if episodes_idx is None else np.asarray(episodes_idx).reshape(-1)
-        parts, episodes = self._locate(self._episodes_before, wanted, "episodes")
-        found = [self.datasets[part].get_episode_data([episode]) for part, episode in zip(parts, episodes, strict=True)]
+        now = self._now
+        wanted = np.arange(now.num_episodes) if episodes_idx is None else np.asarray(episodes_idx).reshape(-1)
+        parts, episodes = self._locate(now._episodes_before, wanted, "episodes")
+        found = [now.datasets[part].get_episode_data([episode]) for part, episode in zip(parts, episodes, strict=True)]
         return _tensors.episode_table([{name: value[0] for name, value in one.items()} for one in found])
 
     def get_col_data(self, col: str) -> Array:
@@ -727,12 +810,15 @@ class ConcatDataset:
                 f"{len(having)} of {len(self.datasets)} datasets have column {col!r}: rows are those of their episodes only"
             )
             warnings.warn(f"get_col_data: {problem}, which `offsets` does not count", stacklevel=2)
-        return np.concatenate([np.asarray(dataset.get_col_data(col)) for dataset in having])
+        found = self._alike([{col: np.asarray(dataset.get_col_data(col))} for dataset in having])
+        return np.concatenate([rows[col] for rows in found])
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Any]:
         """See :meth:`Dataset.get_row_data`."""
-        parts, rows = self._locate(self._rows_before, np.atleast_1d(np.asarray(row_idx)), "rows")
-        found = [self.datasets[part].get_row_data(row) for part, row in zip(parts.tolist(), rows.tolist(), strict=True)]
+        now = self._now
+        parts, rows = self._locate(now._rows_before, np.atleast_1d(np.asarray(row_idx)), "rows")
+        found = [now.datasets[part].get_row_data(row) for part, row in zip(parts.tolist(), rows.tolist(), strict=True)]
+        found = now._alike(found, axes=0)
         if np.ndim(row_idx) == 0:
             return dict(found[0])
         if any(row.keys() != found[0].keys() for row in found):
@@ -740,6 +826,12 @@ class ConcatDataset:
             problem = f"some rows have other columns: {next(other for other in names if other != names[0])} and {names[0]}"
             raise KeyError(f"get_row_data: {problem}; get them one by one, or join datasets with equal columns")
         return {name: np.stack([row[name] for row in found]) for name in found[0]}
+
+
+def _row_shapes(dataset: Any) -> dict[str, tuple[int, ...]]:
+    """The shapes of a row of the columns of a dataset, which may be of a user-defined class, as far as they are known."""
+    shapes: dict[str, tuple[int, ...]] = getattr(dataset, "_row_shapes", {})
+    return shapes
 
 
 def transforms_of(dataset: Any) -> list[Transform]:
@@ -761,7 +853,7 @@ def transformed(dataset: Any, sample: dict[str, Any], episode: int) -> dict[str,
     """A sample that the engine read, with the transforms of `dataset[i]`."""
     if isinstance(dataset, ConcatDataset):
         parts, episodes = dataset._locate(dataset._episodes_before, [episode], "episodes")
-        return transformed(dataset.datasets[int(parts[0])], sample, int(episodes[0]))
+        return dataset._alike([transformed(dataset.datasets[int(parts[0])], sample, int(episodes[0]))])[0]
     if isinstance(dataset, MergeDataset):
         columns = set(dataset.column_names)
         found = {name: value for name, value in sample.items() if name not in columns}

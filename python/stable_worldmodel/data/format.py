@@ -133,8 +133,13 @@ def detect_format(path: str | os.PathLike[str]) -> type[Format] | None:
     """The format of a path; user-defined formats take precedence. `lerobot://OWNER/NAME` names a LeRobot dataset."""
     if os.fspath(path).startswith("lerobot://"):
         return FORMATS["lerobot"]
-    ordered = sorted(FORMATS.values(), key=lambda kind: kind.native)
-    return next((kind for kind in ordered if kind.detect(path)), None)
+    found = detect_user_format(path)
+    return found or next((kind for kind in FORMATS.values() if kind.native and kind.detect(path)), None)
+
+
+def detect_user_format(path: str | os.PathLike[str]) -> type[Format] | None:
+    """The user-defined format of a path, if there is one."""
+    return next((kind for kind in FORMATS.values() if not kind.native and kind.detect(path)), None)
 
 
 def validate_write_mode(mode: str) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -89,8 +90,8 @@ class Adapter:
         self.process, self.transform = process or {}, transform or {}
         self.history, self.dim = history, dim
         self.torch = has_torch() and getattr(model, "backend", "torch") != "numpy"
-        if hasattr(model, "eval") and self.torch and isinstance(model, _torch().nn.Module):
-            model.eval()
+        #: The modules of the model that are in training mode outside of its calls.
+        self._training: list[Any] = []
         self.dtype = self._dtype()
         #: Whether tensors of the model are float32 on the CPU, as the engine's arrays are.
         self._as_engine = self.torch and _torch().device(device).type == "cpu" and self.dtype == _torch().float32
@@ -162,8 +163,21 @@ class Adapter:
             envs: The number of environments, B; that of the first entry for `None`.
         """
         self._infos = prepared(infos, self.process, self.transform)
+        is_module = self.torch and isinstance(self.model, _torch().nn.Module)
+        self._training = [module for module in self.model.modules() if module.training] if is_module else []
         self._envs = len(next(iter(self._infos.values()))) if envs is None else envs
         self._expanded_infos.clear()
+
+    @contextmanager
+    def _evaluating(self) -> Iterator[None]:
+        """The model in evaluation mode for a call."""
+        if self._training:
+            self.model.eval()
+        try:
+            yield
+        finally:
+            for module in self._training:
+                module.training = True
 
     def cost(self, candidates: np.ndarray) -> np.ndarray:
         """The costs `(B, S)` of candidates `(B, S, H, A)`."""
@@ -176,16 +190,17 @@ class Adapter:
             with _torch().inference_mode():
                 return self.cost(candidates)
         parts = self._parts(candidates, "cost")
-        if len(parts) == 1:
-            return self._numpy([self._cost(*parts[0])])
-        # A model may write the costs of the next environments over these, so each is copied before the next.
-        return np.concatenate([self._numpy([self._cost(infos, part)]).copy() for infos, part in parts])
+        with self._evaluating():
+            if len(parts) == 1:
+                return self._numpy([self._cost(*parts[0])])
+            # A model may write the costs of the next environments over these, so each is copied before the next.
+            return np.concatenate([self._numpy([self._cost(infos, part)]).copy() for infos, part in parts])
 
     def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The costs `(B, S)` of candidates `(B, S, H, A)` and their gradients `(B, S, H, A)`."""
         torch = _torch()
         costs, gradients = [], []
-        with torch.inference_mode(False), torch.enable_grad():
+        with self._evaluating(), torch.inference_mode(False), torch.enable_grad():
             for infos, part in self._parts(candidates, "gradient"):
                 part = part.requires_grad_()
                 cost = self._checked_cost(infos, part)
@@ -202,19 +217,26 @@ class Adapter:
     def encode(self) -> tuple[np.ndarray, np.ndarray]:
         """The latents `(B, D)` of the current observation and of the goal."""
         dynamics = self.dynamics
-        with _torch().inference_mode():
+        with self._evaluating(), _torch().inference_mode():
             infos = {key: self._on_device(value) for key, value in self._infos.items()}
-            return self._numpy([dynamics.encode(infos)]), self._numpy([dynamics.encode_goal(infos)])
+            latents = [dynamics.encode(infos), dynamics.encode_goal(infos)]
+            if not all(_torch().is_tensor(latent) for latent in latents):
+                found = ", ".join(type(latent).__name__ for latent in latents)
+                raise TypeError(
+                    f"{type(dynamics).__name__}: encode and encode_goal give {found}; expected torch tensors, because this "
+                    "solver follows the gradient of predict"
+                )
+            return self._numpy(latents[:1]), self._numpy(latents[1:])
 
     def predict(self, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The latents `(N, D)` one model step after `latents` `(N, D)` with actions `(N, A)`."""
-        with _torch().inference_mode():
+        with self._evaluating(), _torch().inference_mode():
             return self._numpy([self.dynamics.predict(self._tensor(latents), self._tensor(actions))])
 
     def predict_vjp(self, latents: np.ndarray, actions: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The vector-Jacobian products of a prediction, `(N, D)` and `(N, A)`, for the output gradient `gradient` `(N, D)`."""
         torch = _torch()
-        with torch.inference_mode(False), torch.enable_grad():
+        with self._evaluating(), torch.inference_mode(False), torch.enable_grad():
             given = self._tensor(latents).requires_grad_(), self._tensor(actions).requires_grad_()
             predicted = self.dynamics.predict(*given)
             gradients = torch.autograd.grad(predicted, given, self._tensor(gradient), allow_unused=True)
@@ -230,7 +252,7 @@ class Adapter:
 
     def constrain(self, candidates: np.ndarray) -> np.ndarray:
         """Constraint values `(B, S, C)`, satisfied when at most 0."""
-        with _torch().inference_mode():
+        with self._evaluating(), _torch().inference_mode():
             parts = self._parts(candidates, "constrain")
             return self._numpy([self.model.get_constraints(infos, part).clone() for infos, part in parts])
 
@@ -238,7 +260,7 @@ class Adapter:
         """The gradient of the constraints with respect to the candidates, weighted by `weights` `(B, S, C)`."""
         torch = _torch()
         gradients, at = [], 0
-        with torch.inference_mode(False), torch.enable_grad():
+        with self._evaluating(), torch.inference_mode(False), torch.enable_grad():
             for infos, part in self._parts(candidates, "constrain gradient"):
                 part = part.requires_grad_()
                 values = self.model.get_constraints(infos, part)

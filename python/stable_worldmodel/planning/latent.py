@@ -67,6 +67,8 @@ class LatentCost:
         if not isinstance(dynamics, LatentDynamics):
             raise TypeError(f"{type(dynamics).__name__} is not LatentDynamics: expected encode, encode_goal and predict")
         self.dynamics = dynamics
+        #: Whether the model gets tensors, or arrays for `"numpy"`.
+        self.backend: str = getattr(dynamics, "backend", "torch")
         objectives = [GoalDistance()] if objective is None else objective
         self.objectives = list(objectives) if isinstance(objectives, Sequence) else [objectives]
 

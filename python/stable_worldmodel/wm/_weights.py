@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
+import re
 import struct
 import zipfile
 from collections.abc import Mapping
@@ -16,9 +18,11 @@ from torch import Tensor, nn
 
 from .pretrained import stored_names
 
-__all__ = ["check_archive", "load_into", "read_capsule", "read_safetensors", "read_state_dict"]
+__all__ = ["check_archive", "check_numbers", "load_into", "read_capsule", "read_safetensors", "read_state_dict"]
 
 _TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "u1", "BOOL": "?"}
+#: The types of weights in which NaN are looked for.
+_WITH_NAN = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 #: The largest header of a file, in bytes.
 _MAX_HEADER = 100_000_000
 
@@ -74,17 +78,42 @@ def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, st
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """The tensors of a file that `torch.save` wrote, or of a safetensors file. No code of the file runs."""
+    """The tensors of a file that `torch.save` wrote, or of a safetensors file. No code of the file runs.
+
+    Raises:
+        RuntimeError: If the file is damaged, or has other objects than tensors, numbers and texts.
+    """
     if Path(path).suffix == ".safetensors":
         return read_safetensors(path)
     _check_not_sparse(path)
     check_archive(path)
-    found: Any = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        found: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        named = re.search(r"GLOBAL (\S+)", str(error))
+        if named is None:
+            raise
+        # What torch says to do here would run code of the file.
+        raise RuntimeError(
+            f"{path}: it holds objects of {named[1]!r}, and only tensors, numbers and texts are read (weights_only); save its "
+            "state dict alone, or import it with `swm checkpoints import`"
+        ) from error
     if isinstance(found, Mapping) and isinstance(found.get("state_dict"), Mapping):
         found = found["state_dict"]
     if not isinstance(found, Mapping) or not all(torch.is_tensor(value) for value in found.values()):
         raise RuntimeError(f"{path}: expected a state dict, a dict of tensors")
     return dict(found)
+
+
+def check_numbers(weights: Mapping[str, Tensor], source: str) -> None:
+    """Refuses weights with NaN, as `swm checkpoints import` does. Masks may be infinite.
+
+    Raises:
+        RuntimeError: If a tensor has one.
+    """
+    for name, value in weights.items():
+        if value.dtype in _WITH_NAN and value.layout == torch.strided and bool(value.isnan().any()):
+            raise RuntimeError(f"{source}: {name!r} has NaN; give weights of a training that did not diverge")
 
 
 def _check_not_sparse(path: str | os.PathLike[str]) -> None:

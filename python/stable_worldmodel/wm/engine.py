@@ -205,14 +205,14 @@ sys.exit(_engine.command(sys.argv[2:]))
 """
 
 
-def _command(arguments: list[str]) -> None:
+def _command(arguments: list[str], shows: bool = True) -> None:
     """Runs the command line in a child process, so that signals and logs of this interpreter are not affected.
 
-    The command saves its state and ends when this interpreter is interrupted or ends.
+    The command saves its state and ends when this interpreter is interrupted or ends. `shows` is whether its output is shown.
     """
     package = Path(__file__).resolve().parent.parent.parent
     # In a terminal the command prints its progress itself; in a notebook its output is copied line by line.
-    output = None if sys.stderr.isatty() else subprocess.PIPE
+    output = None if shows and sys.stderr.isatty() else subprocess.PIPE
     child = subprocess.Popen(
         [sys.executable, "-c", _CHILD, str(package), *arguments],
         stdin=subprocess.PIPE,
@@ -226,7 +226,8 @@ def _command(arguments: list[str]) -> None:
     last_line = ""
     try:
         for line in child.stdout or ():
-            sys.stderr.write(line)
+            if shows:
+                sys.stderr.write(line)
             # Hints may follow an error.
             if line.strip() and not last_line.startswith("error: "):
                 last_line = line

@@ -22,7 +22,7 @@ from .. import _engine, _files
 from ._bounds import bounded
 from ._build import build
 from ._located import home_of, is_stored, located
-from ._weights import load_into, read_state_dict
+from ._weights import check_numbers, load_into, read_state_dict
 from .checkpoints import module_of
 
 __all__ = ["load_pretrained", "save_pretrained"]
@@ -55,13 +55,14 @@ def save_pretrained(
         model: The model.
         run_name: The name of the folder under `$STABLEWM_HOME/checkpoints`.
         config: The configuration: a mapping (also of OmegaConf) whose `_target_` names the model's class, with its
-            arguments. Without one, only the weights are saved, and a warning says so.
+            arguments. Without one, only the weights are saved, and a warning says so, as it does where there is no `_target_`.
         config_key: The key of the model's part of the configuration.
         filename: The file of the weights.
         cache_dir: A folder in place of `$STABLEWM_HOME`.
 
     Raises:
-        ValueError: If the name of the file is no plain name, or that of another file of a checkpoint, or a folder is a URI.
+        ValueError: If the name of the file is no plain name, or that of another file of a checkpoint, a folder is a URI, or
+            the module has an extra state that is no tensor.
         FileExistsError: If the folder has a checkpoint of the engine, or a file to replace is none that this function writes.
     """
     if cache_dir is not None:
@@ -73,27 +74,45 @@ def save_pretrained(
         raise ValueError(f"filename: expected a plain name for the weights, such as 'weights.pt', got {filename!r}")
     if (folder / "weights.safetensors").exists():
         raise FileExistsError(f"{folder}: it holds a checkpoint of the engine; choose another run_name")
+    weights = model.state_dict()
+    if others := [name for name, value in weights.items() if not torch.is_tensor(value)]:
+        raise ValueError(
+            f"{type(model).__name__}: {others[0]!r} of its state dict is no tensor, and load_pretrained reads tensors only; "
+            "return a tensor from get_extra_state"
+        )
+    encoded = None if config is None else _encoded(config, config_key, folder)
     folder.mkdir(parents=True, exist_ok=True)
     # Another process may replace both files.
     with _files.locked(folder, exclusive=False):
         old = [_hash(settings.read_bytes())] if _is_own_settings(settings) else []
-        is_other = config is not None and os.path.lexists(settings) and not old
+        is_other = encoded is not None and os.path.lexists(settings) and not old and not _has(settings, encoded)
         for file in [stored] * (os.path.lexists(stored) and _mark(stored) is None) + [settings] * is_other:
             raise FileExistsError(f"{file}: save_pretrained did not write this file; choose another run_name")
-    weights = model.state_dict()
     # The old configuration as well, because a kill may come before it is replaced.
-    mark: dict[str, Any] = {"config": None, "before": old}
+    mark: dict[str, Any] = {"config": None if encoded is None else _hash(encoded), "before": old}
     files: dict[Path, Callable[[Path], object]] = {stored: lambda beside: _save(weights, beside, mark)}
-    if config is None:
+    if encoded is None:
         warnings.warn(f"{folder}: saved without a config, so load_pretrained cannot build the model", stacklevel=2)
     else:
-        text = json.dumps(_plain(config[config_key] if config_key is not None and config_key in config else config), indent=2)
-        if len(text) > _MOST_SETTINGS:
-            raise ValueError(f"config: it has {len(text)} characters, more than the {_MOST_SETTINGS} that are read again")
-        encoded = text.encode()
-        mark["config"] = _hash(encoded)
         files[settings] = lambda beside: beside.write_bytes(encoded)
     _files.replace(files)
+
+
+def _encoded(config: Any, config_key: str | None, folder: Path) -> bytes:
+    """The text of a configuration to save in a folder."""
+    plain = _plain(config[config_key] if config_key is not None and config_key in config else config)
+    if not isinstance(plain, Mapping) or "_target_" not in plain or plain.get("_partial_"):
+        problem = "saved with a config that describes no module (its _target_), so load_pretrained cannot build the model"
+        warnings.warn(f"{folder}: {problem}", stacklevel=3)
+    text = json.dumps(plain, indent=2)
+    if len(text) > _MOST_SETTINGS:
+        raise ValueError(f"config: it has {len(text)} characters, more than the {_MOST_SETTINGS} that are read again")
+    return text.encode()
+
+
+def _has(file: Path, content: bytes) -> bool:
+    """Whether a file has this content."""
+    return file.is_file() and file.stat().st_size == len(content) and file.read_bytes() == content
 
 
 def _save(weights: Mapping[str, Any], file: Path, mark: Mapping[str, Any]) -> None:
@@ -191,6 +210,7 @@ def load_pretrained(
     model = build(config, trust=True) if trust else _built(config, file.stat().st_size, len(weights))
     if not isinstance(model, nn.Module):
         raise ValueError(f"{settings}: it describes no torch module; expected a _target_ and its arguments")
+    check_numbers(weights, str(file))
     load_into(model, weights, str(file))
     return model
 

@@ -89,7 +89,7 @@ def collected_policy(policy: Any, world: World, *, is_stored: bool, with_weights
         return name, None
     try:
         settings = policy_settings(policy, world)
-        by_engine = _plays_checkpoint(policy) and not world.transforms
+        by_engine = _plays_checkpoint(policy) and not world._infos_differ
         if with_weights and not by_engine and (weights := weights_hash(policy)) is not None:
             settings["weights"] = weights
     except Exception as error:

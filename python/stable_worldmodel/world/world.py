@@ -26,7 +26,14 @@ from ..wrapper.visual import engine_wrappers
 from .env_pool import WorldEnvs
 from .experts import check_experts
 from .metrics import Metrics
-from .records import collected_policy, evaluation_manifest, policy_name, stored_policy, wrapper_records, wrapper_words
+from .records import (
+    collected_policy,
+    evaluation_manifest,
+    policy_name,
+    stored_policy,
+    wrapper_records,
+    wrapper_words,
+)
 from .transforms import FrameTransforms
 
 __all__ = ["World"]
@@ -41,10 +48,11 @@ class World:
     Args:
         env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any id that is
             registered with Gymnasium.
-        num_envs: The number of environments. Episodes do not depend on this number.
+        num_envs: The number of environments. Episodes do not depend on this number, unless a wrapper keeps statistics from one
+            episode to the next, as `NormalizeObservation` of Gymnasium does: a warning names it.
         image_shape: `(height, width)` of frames.
         max_episode_steps: Steps after which episodes are truncated; the environment's time limit for `None`.
-        goal_conditioned: Whether the infos contain `goal`, the frame of the goal.
+        goal_conditioned: Whether the infos contain `goal`, the frame of the goal. Without it, models that read it fail.
         extra_wrappers: Wrappers of every environment, in order: `functools.partial` of a class of `swm.wrapper.visual`, or
             any factory of a `gymnasium.Wrapper`.
         pre_wrappers: Wrappers applied before `extra_wrappers`.
@@ -159,11 +167,14 @@ class World:
                 wrap_goal,
             )
         self.infos: dict[str, np.ndarray] = self._world.infos()
+        has_goal = "goal" in self.infos
         if not goal_conditioned:
             self.infos.pop("goal", None)
         #: The functions that change the frames in infos.
         self.transforms = FrameTransforms(image_transform, goal_transform)
         self._frames = {key: self.infos[key] for key in self.transforms.keys(self.infos)}
+        #: Whether models get other infos than those of the engine, so that they are called from Python.
+        self._infos_differ = bool(self.transforms) or (has_goal and not goal_conditioned)
         self._actions = self._world.actions()
         self.infos["action"] = self._actions[:, None]
         self.envs = WorldEnvs(self)
@@ -172,9 +183,9 @@ class World:
         self._steps_in_engine = True
         #: The seed of the episodes that `step` plays.
         self.seed: int | None = None
-        #: References to policies, their actors, and how often the policy had changed, by the id of the policy. An actor ends
+        #: References to policies, their actors, and the `_changes` of the policy then, by the id of the policy. An actor ends
         #: with its policy.
-        self._actors: dict[int, tuple[Callable[[], Any], Any, int]] = {}
+        self._actors: dict[int, tuple[Callable[[], Any], Any, Any]] = {}
         self._episodes = [0] * self.num_envs
         #: The engine's keys of these episodes.
         self._episode_keys = np.zeros(self.num_envs, np.uint64)
@@ -435,7 +446,8 @@ class World:
 
     def restore(self, state: bytes, index: int = 0) -> None:
         """Restores a snapshot and refreshes `infos`. The same actions repeat the steps after the snapshot bit for bit; the
-        policy, of which a snapshot has nothing, goes on as it was. `step_idx` and the time limit count from the snapshot.
+        policy, of which a snapshot has nothing, goes on as it was. `step_idx` and the time limit count from the snapshot, and
+        `reward` is 0 until the next step, as after a reset.
 
         In a world without episodes (before the first `reset`, after `collect` or `evaluate`), the other environments start one.
         """
@@ -707,12 +719,10 @@ class World:
     ) -> dict[str, int]:
         from ..data.writer import codec_json
 
-        stored_as = codec_json(codec, format=format)
+        stored_as, given = codec_json(codec, format=format), _options.as_json("World.collect", config)
         try:
             with _progress.bar("collect", config["episodes"], progress) as bar:
-                outcome = self._world.collect(
-                    self._playing(policy), path, writer, format, mode, stored_as, json.dumps(config), bar
-                )
+                outcome = self._world.collect(self._playing(policy), path, writer, format, mode, stored_as, given, bar)
         finally:
             self._end_interactive_loop()
         *counts, warning = outcome
@@ -829,7 +839,7 @@ class World:
                     folder = _files.local("video", video)
                     folder.mkdir(parents=True, exist_ok=True)
                     recording = [str(folder), "episode", episodes if videos is None else int(videos)]
-                given = json.dumps({**config, "policy": name, "videos": recording})
+                given = _options.as_json("World.evaluate", {**config, "policy": name, "videos": recording})
                 with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
                     runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
         finally:
@@ -884,13 +894,20 @@ def _stored_path(dataset: Any) -> str:
     path = getattr(dataset, "path", dataset)
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(
-            f"dataset: {type(dataset).__name__}; expected a dataset of swm.data.load_dataset, or its path, URI or name: "
-            "evaluations start from rows of one stored dataset"
+            f"dataset: {type(dataset).__name__}; expected a dataset of swm.data.load_dataset in a format of the engine, or its "
+            "path, URI or name: evaluations start from rows of one stored dataset; store it with swm.data.convert"
         )
     from ..data.dataset import StoredDataset
     from ..data.foreign import ROWS, check_overrides
+    from ..data.format import detect_user_format
     from ..data.utils import resolve
 
+    kind = None if isinstance(dataset, StoredDataset) else detect_user_format(path)
+    if kind is not None:
+        raise ValueError(
+            f"dataset: {os.fspath(path)} has the user-defined format {kind.name!r}; expected a format of the engine, which "
+            "reads the rows of starts; store it in one with swm.data.convert"
+        )
     check_overrides("World.evaluate", dataset, "write what it returns into a dataset, and pass that one", ROWS)
     if isinstance(dataset, StoredDataset):
         # The evaluation opens the path again, where there may be another dataset by now.
@@ -934,7 +951,7 @@ def _check_storable(space: spaces.Space[Any]) -> None:
             )
 
 
-def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any, int]]) -> Callable[[], Any]:
+def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any, Any]]) -> Callable[[], Any]:
     """A reference to a policy, at whose end its actor leaves `actors`: an actor may hold a model of gigabytes."""
     key = id(policy)
 

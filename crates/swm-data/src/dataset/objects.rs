@@ -11,11 +11,13 @@ mod connector;
 #[cfg(feature = "tls")]
 mod patience;
 mod threads;
+mod unchanged;
 mod whole;
 
 pub(crate) use blocks::{BlockCache, ObjectRanges};
 pub(crate) use patience::answer_or_report;
 pub(crate) use threads::{block_on, start_lance};
+pub(crate) use unchanged::{REPLACED, Unchanged, hash_object};
 pub use whole::{list_files, list_names, list_versions, read_file, write_file, write_new_file};
 
 use crate::dataset::location::Location;
@@ -91,7 +93,7 @@ pub fn provide(name: &str, store: Arc<dyn ObjectStore>) {
 fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
     let invalid = |e: object_store::Error| {
         let fix = "check the store's environment variables, such as AWS_ENDPOINT_URL, AWS_REGION and AWS_ACCESS_KEY_ID";
-        Error::config("dataset", format!("{url}: {e}"), fix)
+        Error::config("dataset", format!("{url}: {}", without_passwords(&e.to_string())), fix)
     };
     #[cfg(feature = "tls")]
     provide_tls();
@@ -177,9 +179,21 @@ pub(crate) fn store_error(label: &Path, action: &str, error: &object_store::Erro
             } else {
                 ""
             };
-            Error::external(format!("{}: {action}{hint}", label.display()), other)
+            Error::external(format!("{}: {action}{hint}", label.display()), without_passwords(&other.to_string()))
         }
     }
+}
+
+/// Leaves the user and the password out of the URLs in a text, such as those of `AWS_ENDPOINT_URL` in an error.
+pub(crate) fn without_passwords(text: &str) -> String {
+    let (mut clean, mut rest) = (String::with_capacity(text.len()), text);
+    while let Some(at) = rest.find("://") {
+        let (before, server) = rest.split_at(at + "://".len());
+        clean.push_str(before);
+        let end = server.find(|c: char| c.is_whitespace() || "/?#\"'<>)".contains(c)).unwrap_or(server.len());
+        rest = server[..end].rfind('@').map_or(server, |at| &server[at + 1..]);
+    }
+    clean + rest
 }
 
 /// A local or remote file, read by byte ranges. Several threads may read at the same time.
@@ -194,7 +208,7 @@ pub struct ObjectFile {
 
 /// What changes when an object is replaced.
 #[derive(Clone, Debug)]
-struct Version {
+pub(crate) struct Version {
     size: u64,
     tag: Option<String>,
     /// The time of the last change; `None` if the server does not say it.
@@ -202,20 +216,44 @@ struct Version {
 }
 
 impl Version {
-    fn of(meta: &ObjectMeta) -> Self {
-        // A tag that is marked as weak names the same content.
-        let tag = meta.e_tag.as_ref().map(|tag| tag.strip_prefix("W/").unwrap_or(tag).to_owned());
+    /// The version that an answer states.
+    pub(crate) fn of(meta: &ObjectMeta) -> Self {
         let modified = Some(SystemTime::from(meta.last_modified)).filter(|time| *time != SystemTime::UNIX_EPOCH);
-        Self { size: meta.size, tag, modified }
+        Self { size: meta.size, tag: meta.e_tag.clone(), modified }
     }
 
-    /// Whether two answers of a server are of one object. Several servers behind an address may give other tags, or leave headers out.
-    fn is(&self, other: &Self) -> bool {
-        let same_tag = self.tag.as_ref().zip(other.tag.as_ref()).map(|(a, b)| a == b);
-        let same_time = self.modified.zip(other.modified).map(|(a, b)| a == b);
-        let told: Vec<bool> = same_tag.into_iter().chain(same_time).collect();
-        self.size == other.size && (told.is_empty() || told.contains(&true))
+    /// Whether two answers of a server are of one object. Two strong tags decide; of a weak one the time is compared
+    /// too, and several servers behind an address may leave headers out.
+    pub(crate) fn is(&self, other: &Self) -> bool {
+        let tags = self.tag.as_deref().zip(other.tag.as_deref());
+        let same_tag = tags.map(|(a, b)| without_weak(a) == without_weak(b));
+        let is_strong = tags.is_some_and(|(a, b)| !a.starts_with(WEAK) && !b.starts_with(WEAK));
+        let same_time = self.modified.zip(other.modified).filter(|_| !is_strong).map(|(a, b)| a == b);
+        let reported: Vec<bool> = same_tag.into_iter().chain(same_time).collect();
+        self.size == other.size && (reported.is_empty() || reported.contains(&true))
     }
+
+    /// What two answers have that are not of one object.
+    fn difference(&self, other: &Self) -> String {
+        let marks = |version: &Self| match (&version.tag, version.modified) {
+            (Some(tag), _) => format!("the tag {tag}"),
+            (None, Some(time)) => {
+                let seconds = time.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
+                format!("no tag and the time {seconds} s since 1970")
+            }
+            (None, None) => "neither tag nor time".to_owned(),
+        };
+        let (size, now) = (self.size, other.size);
+        format!("{size} bytes with {} before, {now} bytes with {} now", marks(self), marks(other))
+    }
+}
+
+/// What marks a tag as weak: the object has the same meaning, and maybe other bytes.
+const WEAK: &str = "W/";
+
+/// A tag without the mark, which servers add when they encode an answer.
+fn without_weak(tag: &str) -> &str {
+    tag.strip_prefix(WEAK).unwrap_or(tag)
 }
 
 impl ObjectFile {
@@ -260,9 +298,11 @@ impl ObjectFile {
         let action = "reading it";
         let result = block_on(async move { fetch_with_versions(&*store, &path, &ranges).await })?;
         let (parts, versions) = Self::finish(&self.label, action, result)?;
-        if !versions.iter().all(|version| version.is(&self.version)) {
-            let fix = "open the dataset again; keep its files as they are while they are read";
-            return Err(Error::corrupt(&self.label, "it was written over while it was read", fix));
+        if let Some(other) = versions.iter().find(|version| !version.is(&self.version)) {
+            let causes = "it was written over while it was read, or several servers answer with other tags";
+            let fix = "open the dataset again; keep its files as they are while they are read, and read it from one \
+                       server, or from servers with equal tags";
+            return Err(Error::corrupt(&self.label, format!("{causes}: {}", self.version.difference(other)), fix));
         }
         Ok(parts)
     }
@@ -346,6 +386,18 @@ mod tests {
     use super::*;
 
     #[test]
+    fn passwords_in_urls_are_left_out() {
+        for (text, expected) in [
+            ("GET http://me:se@cret@127.0.0.1:9/b?x=a@b failed", "GET http://127.0.0.1:9/b?x=a@b failed"),
+            ("for url (https://me@host)", "for url (https://host)"),
+            ("http://a/b and s3://u:p@c", "http://a/b and s3://c"),
+            ("mail me@host, or ://", "mail me@host, or ://"),
+        ] {
+            assert_eq!(without_passwords(text), expected);
+        }
+    }
+
+    #[test]
     fn reads_byte_ranges_in_the_requested_order() -> Result<()> {
         let folder = tempfile::tempdir().expect("creating a temporary folder");
         let path = folder.path().join("file");
@@ -374,13 +426,17 @@ mod tests {
             version(9, Some("x"), Some(5)),
             version(9, None, None),
             version(9, Some("x"), None),
-            version(9, Some("other server"), Some(5)),
+            version(9, Some("W/x"), Some(5)),
+            version(9, Some("W/other server"), Some(5)),
             version(9, Some("x"), Some(6)),
         ] {
             assert!(opened.is(&same), "{same:?}");
         }
         for other in [
             version(8, Some("x"), Some(5)),
+            version(9, Some("replaced within a second"), Some(5)),
+            version(9, Some("W/y"), Some(6)),
+            version(9, Some("W/y"), None),
             version(9, Some("y"), Some(6)),
             version(9, Some("y"), None),
             version(9, None, Some(6)),

@@ -99,6 +99,14 @@ pub trait Reader: Send + Sync {
         Ok(vec![])
     }
 
+    /// Compares the files with the hashes that are known of them, where reading rows does not: Lance tables in object stores.
+    ///
+    /// # Errors
+    /// If a file has another hash, or cannot be read.
+    fn check_files(&self) -> Result<()> {
+        Ok(())
+    }
+
     /// The paths and URIs of the datasets that this reader reads, none of which may be replaced meanwhile. Empty if it reads
     /// memory.
     fn sources(&self) -> Vec<PathBuf> {

@@ -1,12 +1,27 @@
-//! The cache: `KINDs--OWNER--NAME/` with `refs/REVISION` (its commit), `lists/COMMIT.json` (its files), `snapshots/COMMIT/` and
-//! `partial/` (interrupted downloads).
+//! The cache: `KINDs--OWNER--NAME/` with `refs/REVISION` (its commit), `lists/COMMIT.json` (its files), `snapshots/COMMIT/`,
+//! `verified/COMMIT.json` (the files that were compared with their hashes) and `partial/` (interrupted downloads). Each hub has
+//! a cache of its own, because another hub may have other files under the same names.
 
+use super::client::Client;
 use super::{HubFile, HubUri, RepoKind};
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result, files};
 
+/// The address of the hub, unless another one is given.
+pub(super) const ENDPOINT: &str = "https://huggingface.co";
+
 /// The largest list of files, in bytes.
-const MAX_LIST: u64 = 256 << 20;
+pub(super) const MAX_LIST: u64 = 256 << 20;
+
+/// The cache of a hub: the folder itself, or for another address than the default one a folder in it.
+pub(super) fn of_hub(cache: &Path, client: &Client) -> PathBuf {
+    if client.endpoint() == ENDPOINT {
+        return cache.to_owned();
+    }
+    let host = url::Url::parse(client.endpoint()).ok().and_then(|url| url.host_str().map(str::to_owned));
+    let host = host.unwrap_or_default().replace(|c: char| !c.is_ascii_alphanumeric() && !".-".contains(c), "-");
+    cache.join(format!("{host}-{}", &blake3::hash(client.endpoint().as_bytes()).to_hex()[..16]))
+}
 
 /// The folder of a repository in the cache.
 pub(super) struct Folder(PathBuf);
@@ -24,6 +39,11 @@ impl Folder {
     /// The folder of the files of a commit.
     pub fn snapshot(&self, commit: &str) -> PathBuf {
         self.0.join("snapshots").join(commit)
+    }
+
+    /// The record of the files of a commit that were compared with their hashes.
+    pub fn verified(&self, commit: &str) -> PathBuf {
+        self.0.join("verified").join(format!("{commit}.json"))
     }
 
     /// The file of an interrupted download. `part` names its content, so that an equal file of another commit continues it.
@@ -48,12 +68,13 @@ impl Folder {
         self.0.join("refs").join(super::client::encoded(revision))
     }
 
-    /// The files of a commit, if they were listed before.
+    /// The files of a commit, if they were listed before. A list without files is asked for again.
     pub fn known_files(&self, commit: &str) -> Option<Vec<HubFile>> {
         let bytes = files::read(&self.list(commit), MAX_LIST).ok()?;
         let listed: Vec<HubFile> = serde_json::from_slice(&bytes).ok()?;
         let no_git = super::uri::git_folder(listed.iter().map(|file| file.path.as_str())).is_none();
-        (no_git && listed.iter().all(|file| super::uri::is_inside(&file.path))).then_some(listed)
+        let all_inside = listed.iter().all(|file| super::uri::is_inside(&file.path));
+        (no_git && all_inside && !listed.is_empty()).then_some(listed)
     }
 
     pub fn remember_files(&self, commit: &str, listed: &[HubFile]) -> Result<()> {
@@ -66,7 +87,8 @@ impl Folder {
     }
 }
 
-fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+/// Writes a file of the cache, and makes its folder.
+pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let folder = path.parent().unwrap_or(path);
     std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating a folder", error))?;
     files::write(path, bytes)
@@ -85,6 +107,30 @@ mod tests {
             folder.remember_commit(revision, commit)?;
             assert_eq!(folder.known_commit(revision).as_deref(), Some(commit));
         }
+        Ok(())
+    }
+
+    #[test]
+    fn each_hub_has_a_cache_of_its_own() {
+        let of = |endpoint: &str| of_hub(Path::new("hub"), &Client::new(endpoint, None).expect("a client"));
+        assert_eq!(of(ENDPOINT), Path::new("hub"));
+        assert_eq!(of("https://huggingface.co/"), Path::new("hub"));
+        let others =
+            ["http://127.0.0.1:1", "http://127.0.0.1:2", "https://127.0.0.1:1", "http://[::1]:1", "https://a/b"];
+        let folders: std::collections::BTreeSet<PathBuf> = others.iter().map(|endpoint| of(endpoint)).collect();
+        assert_eq!(folders.len(), others.len(), "{folders:?}");
+        assert!(folders.iter().all(|folder| folder.parent() == Some(Path::new("hub"))), "{folders:?}");
+    }
+
+    #[test]
+    fn an_empty_list_of_files_is_asked_for_again() -> Result<()> {
+        let cache = tempfile::tempdir().expect("a folder");
+        let folder = Folder::of(cache.path(), &HubUri::parse("hf://a/b", RepoKind::Model)?);
+        let file = HubFile { path: "a".to_owned(), size: 1, sha256: None, git_id: None };
+        folder.remember_files("c", std::slice::from_ref(&file))?;
+        assert_eq!(folder.known_files("c"), Some(vec![file]));
+        folder.remember_files("c", &[])?;
+        assert_eq!(folder.known_files("c"), None);
         Ok(())
     }
 }

@@ -75,7 +75,7 @@ impl Default for Content {
 impl Client {
     pub fn from_env() -> Result<Self> {
         let variable = |name: &str| std::env::var(name).ok().filter(|value| !value.is_empty());
-        let endpoint = variable("HF_ENDPOINT").unwrap_or_else(|| "https://huggingface.co".to_owned());
+        let endpoint = variable("HF_ENDPOINT").unwrap_or_else(|| super::cache::ENDPOINT.to_owned());
         let file = variable("HF_TOKEN_PATH").map(PathBuf::from).or_else(|| {
             let home = variable("HF_HOME").map(PathBuf::from);
             let home = home.or_else(|| Some(PathBuf::from(variable("HOME")?).join(".cache").join("huggingface")));
@@ -156,6 +156,7 @@ impl Client {
             #[serde(default)]
             size: u64,
             lfs: Option<Lfs>,
+            oid: Option<String>,
         }
         #[derive(Deserialize)]
         struct Lfs {
@@ -177,11 +178,12 @@ impl Client {
                 let (size, sha256) = entry.lfs.map_or((entry.size, None), |lfs| {
                     (lfs.size, Some(lfs.oid.trim_start_matches("sha256:").to_ascii_lowercase()))
                 });
+                let git_id = entry.oid.filter(|id| sha256.is_none() && super::uri::is_commit(id));
                 if let Some(hash) = sha256.as_ref().filter(|hash| !super::uri::is_sha256(hash)) {
                     let problem = format!("it lists '{}', which is no SHA-256 hash", hash.escape_debug());
                     return Err(Error::corrupt(&url, problem, "check the address of the hub (HF_ENDPOINT)"));
                 }
-                files.push(HubFile { path: entry.path, size, sha256 });
+                files.push(HubFile { path: entry.path, size, sha256, git_id });
             }
             match next_page(&headers) {
                 Some(_) if files.len() > MAX_LISTED || read > MAX_ANSWER => break,

@@ -3,6 +3,7 @@
 use super::cache::Folder;
 use super::client::{Body, Client, encoded_path, named, next_chunk, run};
 use super::pace::Pace;
+use super::verified::{self, OtherHash, Stamp, Verified};
 use super::{Hub, HubFile, HubUri, Pulled};
 use reqwest::header::{HeaderMap, HeaderValue, RANGE};
 use reqwest::{Method, Response, StatusCode};
@@ -10,7 +11,7 @@ use sha2::{Digest as _, Sha256};
 use std::fs::{File, OpenOptions};
 use std::io::{Read as _, Write as _};
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use swm_core::files::{self, Lock};
 use swm_core::run::{Control, Event, Progress, Stage};
@@ -40,7 +41,10 @@ impl Hub {
         let folder = Folder::of(&self.cache, uri);
         match (self.client.commit(uri), folder.known_commit(&uri.revision)) {
             (Ok(commit), _) => {
-                folder.remember_commit(&uri.revision, &commit)?;
+                // A cache that cannot be written can be read.
+                if folder.known_commit(&uri.revision).as_deref() != Some(&*commit) {
+                    folder.remember_commit(&uri.revision, &commit)?;
+                }
                 Ok(uri.at(&commit))
             }
             (Err(error @ Error::External { .. }), Some(commit)) => {
@@ -51,7 +55,8 @@ impl Hub {
         }
     }
 
-    /// Downloads a file, a folder or a whole repository into the cache, without what is there already.
+    /// Downloads a file, a folder or a whole repository into the cache, without what is there already. Files of the
+    /// cache that have changed since they were compared with their hashes are compared again.
     ///
     /// # Errors
     /// As [`Hub::pin`]; when there is no such file, a downloaded file has another hash or size than the hub says, or the user
@@ -68,36 +73,118 @@ impl Hub {
                 listed
             }
         };
+        if listed.is_empty() {
+            return Err(Error::config(
+                pinned.to_string(),
+                "has no files",
+                "name another repository, or another revision",
+            ));
+        }
         let chosen: Vec<&HubFile> = listed.iter().filter(|file| pinned.contains(&file.path)).collect();
         if chosen.is_empty() {
             let names = listed.iter().map(|file| file.path.as_str());
             let hint = format!("{} lists the files", self.client.page(uri));
             return Err(Error::unknown("file of the repository", &uri.path, names, hint));
         }
-        let snapshot = folder.snapshot(commit);
-        let is_missing = |file: &&HubFile| {
-            std::fs::metadata(snapshot.join(&file.path)).map_or(true, |found| found.len() != file.size)
-        };
-        let missing: Vec<&HubFile> = chosen.iter().copied().filter(is_missing).collect();
-        let mut downloaded = 0;
-        if !missing.is_empty() {
-            // Another process that downloads this repository is waited for by its error.
-            let _lock = Lock::folder(folder.path())?;
-            let name = uri.to_string();
-            let total = missing.len();
-            control.emit(Event::Started(Stage { name: STAGE, subject: &[&name], total, unit: "files" }));
-            for (done, file) in missing.into_iter().enumerate() {
-                downloaded += self.fetch(&pinned, file, &folder, control)?;
-                control.progress(Progress { stage: STAGE, done: done + 1, total, unit: "files", metrics: &[] });
-            }
-            control.emit(Event::Finished { stage: STAGE, metrics: &[("files", total as f64)] });
-        }
+        let mut verified = Verified::read(folder.verified(commit));
+        let completed = self.complete(&pinned, &chosen, &folder, &mut verified, control);
+        verified.save();
+        let (snapshot, downloaded) = completed?;
         let (files, bytes) = (chosen.len(), chosen.iter().map(|file| file.size).sum());
         Ok(Pulled { pinned: pinned.to_string(), path: snapshot.join(&pinned.path), files, bytes, downloaded })
     }
 
-    /// Downloads a file; returns the number of bytes that the network transferred.
-    fn fetch(&self, pinned: &HubUri, file: &HubFile, folder: &Folder, control: &mut Control<'_>) -> Result<u64> {
+    /// Downloads the files that the cache lacks; returns the folder of the commit, and the number of bytes that the
+    /// network transferred.
+    fn complete(
+        &self,
+        pinned: &HubUri,
+        chosen: &[&HubFile],
+        folder: &Folder,
+        verified: &mut Verified,
+        control: &mut Control<'_>,
+    ) -> Result<(PathBuf, u64)> {
+        let snapshot = folder.snapshot(&pinned.revision);
+        if let Some(old) = self.old_snapshot(pinned, chosen, &snapshot, verified, control)? {
+            return Ok((old, 0));
+        }
+        let mut missing = verified.missing(chosen, &snapshot, control)?;
+        if missing.is_empty() {
+            return Ok((snapshot, 0));
+        }
+        // Another process that downloads this repository is waited for by its error, unless it has brought all files.
+        let lock = Lock::folder(folder.path());
+        verified.reload();
+        missing.retain(|file| !verified.has(file, &snapshot));
+        if missing.is_empty() {
+            return Ok((snapshot, 0));
+        }
+        let _lock = lock?;
+        let downloaded = self.download(pinned, missing, folder, verified, control);
+        // Before the lock is released: the next process reads the record when it has the lock.
+        verified.save();
+        Ok((snapshot, downloaded?))
+    }
+
+    /// The folder of the commit in the cache that earlier builds had for all hubs, if this hub's own cache has none,
+    /// and all files there have the hashes that this hub lists.
+    fn old_snapshot(
+        &self,
+        pinned: &HubUri,
+        chosen: &[&HubFile],
+        own: &Path,
+        verified: &mut Verified,
+        control: &mut Control<'_>,
+    ) -> Result<Option<PathBuf>> {
+        let Some(shared) = self.shared.as_ref().filter(|_| !own.exists()) else { return Ok(None) };
+        let old = Folder::of(shared, pinned).snapshot(&pinned.revision);
+        if !chosen.iter().all(|file| file.is_hashed() && verified::find(file, &old).is_some()) {
+            return Ok(None);
+        }
+        let is_compared = |verified: &Verified| chosen.iter().all(|file| verified.has(file, &old));
+        if !is_compared(verified) {
+            verified.missing(chosen, &old, control)?;
+            if !is_compared(verified) {
+                return Ok(None);
+            }
+            let message = format!("{} has the files that {} lists; using them", old.display(), self.client.endpoint());
+            control.emit(Event::Log(&message));
+        }
+        Ok(Some(old))
+    }
+
+    /// Downloads files; returns the number of bytes that the network transferred.
+    fn download(
+        &self,
+        pinned: &HubUri,
+        missing: Vec<&HubFile>,
+        folder: &Folder,
+        verified: &mut Verified,
+        control: &mut Control<'_>,
+    ) -> Result<u64> {
+        let snapshot = folder.snapshot(&pinned.revision);
+        let (name, total, mut downloaded) = (pinned.at("main").to_string(), missing.len(), 0);
+        control.emit(Event::Started(Stage { name: STAGE, subject: &[&name], total, unit: "files" }));
+        for (done, file) in missing.into_iter().enumerate() {
+            let fetched = self.fetch(pinned, file, folder, control);
+            let (transferred, stamp) = fetched.map_err(|error| with_old_file(error, &snapshot.join(&file.path)))?;
+            verified.add(file, stamp);
+            downloaded += transferred;
+            control.progress(Progress { stage: STAGE, done: done + 1, total, unit: "files", metrics: &[] });
+        }
+        control.emit(Event::Finished { stage: STAGE, metrics: &[("files", total as f64)] });
+        Ok(downloaded)
+    }
+
+    /// Downloads a file; returns the number of bytes that the network transferred, and the stamp of the file if it has
+    /// a listed hash.
+    fn fetch(
+        &self,
+        pinned: &HubUri,
+        file: &HubFile,
+        folder: &Folder,
+        control: &mut Control<'_>,
+    ) -> Result<(u64, Option<Stamp>)> {
         let (part, path) = (folder.partial(&pinned.revision, file), folder.snapshot(&pinned.revision).join(&file.path));
         for path in [&part, &path] {
             let folder = path.parent().unwrap_or(path);
@@ -139,10 +226,40 @@ impl Hub {
                 }
             }
         }
+        let stamp = Stamp::at(&part).filter(|_| file.is_hashed());
         check_hash(&part, &url, file, control)?;
+        set_aside(&path, control)?;
         std::fs::rename(&part, &path).map_err(|error| Error::io(&path, "saving a download", error))?;
-        Ok(transferred)
+        Ok((transferred, stamp))
     }
+}
+
+/// The path that a file gets which is replaced by a download.
+fn changed_name(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".changed");
+    name.into()
+}
+
+/// Keeps a file that a download replaces, because the user may have edited it.
+fn set_aside(path: &Path, control: &mut Control<'_>) -> Result<()> {
+    if !std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_dir()) {
+        return Ok(());
+    }
+    let kept = changed_name(path);
+    std::fs::rename(path, &kept).map_err(|error| Error::io(&kept, "keeping the old file", error))?;
+    control.emit(Event::Log(&format!("{} is the file that the download replaces", kept.display())));
+    Ok(())
+}
+
+/// The error of a download, which names the file that it would replace.
+fn with_old_file(error: Error, path: &Path) -> Error {
+    if !matches!(error, Error::External { .. }) || !path.exists() {
+        return error;
+    }
+    let fix = format!("run it again with a connection, which keeps this file as {}", changed_name(path).display());
+    let problem = "it differs from the hub's file, which could not be downloaded";
+    Error::external(path.display().to_string(), format!("{problem}; {fix}: {error}"))
 }
 
 /// Waits, and can be stopped.
@@ -211,29 +328,36 @@ fn chunk(url: &str, mut answer: Response) -> Result<(Option<bytes::Bytes>, Respo
 
 /// Checks the hash of a complete download, and deletes one that differs.
 fn check_hash(part: &Path, url: &str, file: &HubFile, control: &mut Control<'_>) -> Result<()> {
-    let Some(expected) = &file.sha256 else { return Ok(()) };
-    let (found, _) = sha256(part, control)?;
-    if found == *expected {
-        return Ok(());
-    }
+    let Some(OtherHash { kind, listed, found }) = OtherHash::find(part, file, control)? else { return Ok(()) };
     files::delete_file(part)?;
-    let problem = format!("the downloaded file has the SHA-256 hash {found}, and the hub says {expected}");
+    let problem = format!("the downloaded file has the {kind} {found}, and the hub says {listed}");
     Err(Error::corrupt(url, problem, "run it again; if it happens again, tell the owner of the repository"))
 }
 
-/// The SHA-256 hash of a file in hexadecimal digits, and its size. Large files take minutes, so that the caller can stop it.
+/// The SHA-256 hash of a file in hexadecimal digits, and its size.
 pub(super) fn sha256(path: &Path, control: &mut Control<'_>) -> Result<(String, u64)> {
+    let mut hash = Sha256::new();
+    let size = read_blocks(path, control, |block| hash.update(block))?;
+    Ok((hexadecimal(&hash.finalize()), size))
+}
+
+/// The digits of a hash.
+pub(super) fn hexadecimal(hash: &[u8]) -> String {
+    hash.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Reads a file in blocks; returns its size. Large files take minutes, so that the caller can stop it.
+pub(super) fn read_blocks(path: &Path, control: &mut Control<'_>, mut each: impl FnMut(&[u8])) -> Result<u64> {
     let io = |error| Error::io(path, "reading the file", error);
-    let (mut file, mut hash, mut block, mut size) = (File::open(path).map_err(io)?, Sha256::new(), vec![0; BLOCK], 0);
+    let (mut file, mut block, mut size) = (File::open(path).map_err(io)?, vec![0; BLOCK], 0);
     loop {
         control.check()?;
         match file.read(&mut block).map_err(io)? {
-            0 => break,
+            0 => return Ok(size),
             count => {
-                hash.update(&block[..count]);
+                each(&block[..count]);
                 size += count as u64;
             }
         }
     }
-    Ok((hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect(), size))
 }

@@ -14,6 +14,7 @@ mod pointer;
 mod replaced;
 mod upload;
 mod uri;
+mod verified;
 
 pub use pointer::check_no_pointer;
 pub use upload::{PushOptions, Pushed};
@@ -33,6 +34,16 @@ pub struct HubFile {
     /// The SHA-256 hash of a large file; `None` for a file that is stored in Git.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sha256: Option<String>,
+    /// The id of a file that is stored in Git, which is a SHA-1 hash; `None` for a large file, and if the hub states none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub git_id: Option<String>,
+}
+
+impl HubFile {
+    /// Whether the hub lists a hash of the file.
+    fn is_hashed(&self) -> bool {
+        self.sha256.is_some() || self.git_id.is_some()
+    }
 }
 
 /// What [`Hub::pull`] found.
@@ -53,7 +64,10 @@ pub struct Pulled {
 /// A client of the hub with a cache of files.
 pub struct Hub {
     client: Client,
+    /// The cache of this hub.
     cache: PathBuf,
+    /// The cache that earlier builds had for all hubs, if this hub has another one.
+    shared: Option<PathBuf>,
 }
 
 impl Hub {
@@ -63,7 +77,7 @@ impl Hub {
     /// # Errors
     /// When the address is invalid, or the client cannot be made.
     pub fn new(cache: &Path) -> Result<Self> {
-        Ok(Self { client: Client::from_env()?, cache: cache.to_owned() })
+        Ok(Self::with(Client::from_env()?, cache))
     }
 
     /// A client for an address and a token.
@@ -71,6 +85,11 @@ impl Hub {
     /// # Errors
     /// As [`Hub::new`].
     pub fn at(endpoint: &str, token: Option<&str>, cache: &Path) -> Result<Self> {
-        Ok(Self { client: Client::new(endpoint, token.map(str::to_owned))?, cache: cache.to_owned() })
+        Ok(Self::with(Client::new(endpoint, token.map(str::to_owned))?, cache))
+    }
+
+    fn with(client: Client, cache: &Path) -> Self {
+        let own = cache::of_hub(cache, &client);
+        Self { shared: (own != cache).then(|| cache.to_owned()), cache: own, client }
     }
 }

@@ -59,7 +59,7 @@ mod tests {
 
     fn checked(listed: &[&str], pushed: &[&str]) -> Result<()> {
         let uri = HubUri::parse("hf://datasets/lab/rooms", RepoKind::Dataset).expect("a URI");
-        let file = |path: &&str| HubFile { path: (*path).to_owned(), size: 1, sha256: None };
+        let file = |path: &&str| HubFile { path: (*path).to_owned(), size: 1, sha256: None, git_id: None };
         check(&uri, &listed.iter().map(file).collect::<Vec<_>>(), &pushed.iter().copied().collect())
     }
 

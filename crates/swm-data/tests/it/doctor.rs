@@ -202,6 +202,23 @@ fn collected_dataset_has_no_findings() {
 }
 
 #[test]
+fn finds_columns_with_more_rows_than_the_episodes() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    for format in ["folder", "video"] {
+        let [path, longer] = ["d", "longer"].map(|name| folder.path().join(format!("{name}.{format}")));
+        write(&path, WriteMode::Create, 2, 0..4);
+        write(&longer, WriteMode::Create, 2, 0..5);
+        assert_eq!(diagnose(&*open(&path).expect("opening the dataset")).problems(), 0);
+        std::fs::copy(longer.join("state.npz"), path.join("state.npz")).expect("copying a file");
+        let diagnosis = diagnose(&*open(&path).expect("opening the dataset"));
+        let [all, more] = [4, 5].map(|episodes| (0..episodes).map(rows).sum::<usize>());
+        let expected = format!("'state' has {more} rows, and the episodes have {all}");
+        assert_eq!(problem(&diagnosis), (expected, vec![]));
+        assert_eq!(diagnosis.intact.len(), 4);
+    }
+}
+
+#[test]
 fn finds_a_repeated_episode_index_in_a_table() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.lance");
     let reader = open(&path).expect("opening the dataset");

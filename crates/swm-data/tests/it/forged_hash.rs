@@ -1,10 +1,12 @@
 //! A table of a stranger whose data files state the content hashes of other episodes.
 
 use crate::fuzz::copy_all;
-use crate::sample::write;
+use crate::objects;
+use crate::sample::{check, write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use swm_data::doctor::examine;
-use swm_data::{CacheConfig, Reader, StepRange, WriteMode, open};
+use swm_data::{CacheConfig, Location, Reader, StepRange, WriteMode, checksum, open, views};
 
 /// The only data file of a table.
 fn data_file(table: &Path) -> PathBuf {
@@ -86,9 +88,7 @@ fn caches_do_not_trust_it_and_the_doctor_finds_it() {
         assert_eq!(hashes[0], hashes[1], "the hashes are only stated");
 
         let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
-        let cached = |reader: &std::sync::Arc<dyn Reader>| {
-            images(&*cache.over(std::sync::Arc::clone(reader), &["pixels"]).expect("a cache"))
-        };
+        let cached = |reader: &Arc<dyn Reader>| images(&*cache.over(Arc::clone(reader), &["pixels"]).expect("a cache"));
         let (theirs, ours) = (cached(&strange), cached(&own));
         assert!(ours == images(&*own) && ours != theirs, "named {is_named}");
 
@@ -115,4 +115,67 @@ fn caches_know_which_column_of_a_file_is_which() {
     assert_ne!(own.cache_key().expect("a key"), strange.cache_key().expect("a key"));
     let diagnosis = examine(&*strange, &[], &mut swm_core::run::Control::new()).expect("a diagnosis");
     assert!(diagnosis.findings.iter().any(|it| it.what.contains("content hash")), "{:?}", diagnosis.findings);
+}
+
+/// A folder with a bucket that has a table, the table, and its location on a web server.
+fn on_a_web_server() -> (tempfile::TempDir, PathBuf, Location) {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let table = folder.path().join("bucket/d.lance");
+    std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
+    write(&table, WriteMode::Create, 6, 0..6);
+    let web = objects::serve(folder.path(), false);
+    (folder, table, Location::parse(&format!("{web}/bucket/d.lance")).expect("a location"))
+}
+
+/// Changes a byte of the data file that no value depends on: a digit of a content hash.
+fn change_a_byte(table: &Path) {
+    let path = data_file(table);
+    let mut bytes = std::fs::read(&path).expect("a data file");
+    let digit = stated(&bytes)[0].start;
+    bytes[digit] = if bytes[digit] == b'0' { b'1' } else { b'0' };
+    std::fs::write(&path, bytes).expect("writing the data file");
+}
+
+#[test]
+fn data_files_in_an_object_store_are_compared_with_their_names() {
+    let (folder, table, location) = on_a_web_server();
+    let reader = open(&location).expect("opening the dataset");
+    let expected = checksum(&*reader).expect("the checksum");
+    assert_eq!(expected, checksum(&*open(&table).expect("opening the files")).expect("their checksum"));
+    assert_eq!(reader.irregularities().expect("reading the dataset"), []);
+
+    change_a_byte(&table);
+    let reader = open(&location).expect("opening the dataset");
+    check(&*reader, 0);
+    let own = folder.path().join("own.lance");
+    write(&own, WriteMode::Create, 6, 0..6);
+    let (own, cache) = (open(&own).expect("opening the files"), CacheConfig::Memory { bytes: 1 << 20 });
+    let views = [
+        Ok(Arc::clone(&reader)),
+        cache.over(Arc::clone(&reader), &["state"]),
+        views::subset(Arc::clone(&reader), vec![1]),
+        views::concat(vec![Arc::clone(&own), Arc::clone(&reader)]),
+        views::merge(Arc::clone(&reader), Arc::clone(&own), &[]),
+        views::merge(own, Arc::clone(&reader), &[]),
+    ];
+    for view in views {
+        let error = checksum(&*view.expect("a view")).expect_err("another file").to_string();
+        assert!(error.contains("the hash in its name") && error.contains("d.lance/data/"), "{error}");
+    }
+    let found = examine(&*reader, &[], &mut swm_core::run::Control::new()).expect("a diagnosis");
+    let finding = found.findings.iter().find(|finding| finding.what.contains("the hash in its name"));
+    assert_eq!(finding.map(|finding| finding.episodes.len()), Some(6), "{found:?}");
+    assert!(found.intact.is_empty());
+}
+
+#[test]
+fn data_files_in_an_object_store_that_are_replaced_while_they_are_open_are_refused() {
+    let (_folder, table, location) = on_a_web_server();
+    let reader = open(&location).expect("opening the dataset");
+    let rows = [StepRange::new(0, 0, 2)];
+    reader.read(&["state"], &rows).expect("reading rows");
+    change_a_byte(&table);
+    let error = reader.read(&["pixels"], &rows).expect_err("another file").to_string();
+    assert!(error.contains("replaced since the dataset was opened"), "{error}");
+    check(&*open(&location).expect("opening it again"), 0);
 }

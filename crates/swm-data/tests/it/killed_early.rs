@@ -51,6 +51,27 @@ fn first_files_of_killed_writers_are_continued_and_replaced() {
 }
 
 #[test]
+#[cfg(feature = "hdf5")]
+fn hdf5_files_that_are_being_created_are_called_so() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("d.h5");
+    write(&path, WriteMode::Create, 1, 0..2);
+    let whole = std::fs::read(&path).expect("the file");
+    // The signature is written last when a file is created.
+    let begun = [&[0; 8], &whole[8..16]].concat();
+    for content in [&[][..], &begun] {
+        put(&path, content);
+        let error = open(&path).err().expect("a file without a signature").to_string();
+        assert!(error.contains("is being created") && error.contains("open it again in a moment"), "{error}");
+    }
+    put(&path, &whole);
+    check(&*open(&path).expect("opening"), 0);
+    put(&path, b"thesis, which is no HDF5 file");
+    let error = open(&path).err().expect("a file of another program").to_string();
+    assert!(!error.contains("being created"), "{error}");
+}
+
+#[test]
 fn files_of_the_user_with_such_names_stay() {
     let folder = tempfile::tempdir().expect("creating a folder");
     let no_rows = no_rows(folder.path());

@@ -225,6 +225,8 @@ fn invalid_settings_are_explained() {
     assert!(wrong(config(4, 4)).contains("the longest has 11"));
     assert!(wrong(LoaderConfig { batch_size: 0, ..config(1, 1) }).contains("batch_size"));
     assert!(wrong(LoaderConfig { episodes: Some(vec![9]), ..config(1, 1) }).contains("positions below 9"));
+    let twice = wrong(LoaderConfig { episodes: Some(vec![3, 5, 3]), ..config(1, 1) });
+    assert!(twice.contains("episodes: 3 is there twice"), "{twice}");
     assert!(wrong(LoaderConfig { batch_size: 1000, drop_last: true, ..config(1, 1) }).contains("drop_last"));
 }
 

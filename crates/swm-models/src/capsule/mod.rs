@@ -25,13 +25,14 @@ pub mod reference;
 
 use crate::checkpoint;
 use crate::nn::parameters::{HostTensor, Named};
-use crate::stored::StoredCheckpoint;
+use crate::stored::{self, StoredCheckpoint};
 use crate::tensor_file;
 use half::f16;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use std::fs::File;
+use std::io::{ErrorKind, Write as _};
 use std::path::Path;
-use swm_core::files::Lock;
 use swm_core::text::one_line;
 use swm_core::{Batch, Error, Manifest, Result, files, manifest};
 
@@ -164,18 +165,43 @@ impl Capsule {
         Ok(capsule)
     }
 
+    /// Writes the capsule to a file and returns its hash. Replaces a capsule of the same model only.
+    ///
+    /// # Errors
+    /// When it is larger than [`MAX_BYTES`], the file holds another model or is no capsule, or it cannot be written.
+    pub fn write_own(&self, path: &Path) -> Result<String> {
+        let (bytes, hash) = self.bytes(path)?;
+        if write_new(path, &bytes)? {
+            return Ok(hash);
+        }
+        let old = Self::read(path)?;
+        if !old.is_same_model(self) {
+            let problem = format!("it holds another model, with the weights {}", old.weights_hash());
+            let fix = "give another --output, or delete the file by hand";
+            return Err(Error::config(path.display().to_string(), problem, fix));
+        }
+        files::write(path, &bytes)?;
+        Ok(hash)
+    }
+
     /// Writes the capsule to a file and returns its hash.
     ///
     /// # Errors
     /// When it is larger than [`MAX_BYTES`], or the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<String> {
+        let (bytes, hash) = self.bytes(path)?;
+        files::write(path, &bytes)?;
+        Ok(hash)
+    }
+
+    /// The bytes of the capsule, for the file `path`, and its hash.
+    fn bytes(&self, path: &Path) -> Result<(Vec<u8>, String)> {
         let (bytes, hash) = file::encode(self)?;
         if bytes.len() as u64 > MAX_BYTES {
             let problem = format!("the capsule has {} bytes, more than {MAX_BYTES}", bytes.len());
             return Err(Error::config(path.display().to_string(), problem, "train a smaller model, or smaller images"));
         }
-        files::write(path, &bytes)?;
-        Ok(hash)
+        Ok((bytes, hash))
     }
 
     /// Returns the hash of the capsule.
@@ -209,19 +235,32 @@ impl Capsule {
     }
 }
 
+/// Writes a file where none exists, and returns whether it did: nothing that another process writes there meanwhile is replaced.
+fn write_new(path: &Path, bytes: &[u8]) -> Result<bool> {
+    let io = |error| Error::io(path, "writing the file", error);
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    // What a kill leaves has the name of a temporary file of `files::write`, which the next command deletes.
+    let staged = path.with_file_name(format!(".{name}.{}.tmp", std::process::id()));
+    files::delete_file(&staged)?;
+    let written = File::create_new(&staged).and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_data()));
+    let linked = written.map(|()| std::fs::hard_link(&staged, path));
+    files::delete_file(&staged)?;
+    match linked.map_err(io)? {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(false),
+        // A file system without hard links.
+        Err(_) => files::write(path, bytes).map(|()| true),
+    }
+}
+
 /// Writes the checkpoint of a capsule to a run folder, and returns the hash of its weights. Replaces nothing. If a file
 /// cannot be written, nothing remains of the others.
 ///
 /// # Errors
 /// As [`checkpoint::check_unused`], when another process writes to `run`, or a file cannot be written.
 pub fn export(capsule: &Capsule, run: &Path) -> Result<String> {
-    let _lock = Lock::folder(run)?;
-    checkpoint::check_unused(run)?;
-    let written = checkpoint::write(run, &capsule.checkpoint, &mut capsule.manifest.clone(), &capsule.weights, &[]);
-    if written.is_err() {
-        files::remove_empty_folder(run)?;
-    }
-    written
+    let mut manifest = capsule.manifest.clone();
+    stored::write_unused(run, || checkpoint::write(run, &capsule.checkpoint, &mut manifest, &capsule.weights, &[]))
 }
 
 /// Returns the error for a damaged capsule.

@@ -5,8 +5,8 @@ use super::model::DinoWm;
 use super::step::{DinoWmStep, TrainBatch, step};
 use crate::checks;
 use crate::nn::{BackboneConfig, Init, Named};
-use crate::pixels::{self, ImageNormalization};
-use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
+use crate::pixels::{self, Frames, ImageNormalization};
+use crate::train::{DatasetInfo, FixedPart, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
 use crate::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
@@ -28,6 +28,11 @@ impl Trainable for DinoWm {
             id: "tiny",
             summary: "64 px, a small encoder with random weights: for first trials on two CPU cores",
             toml: include_str!("../../presets/dino_wm/tiny.toml"),
+        },
+        Preset {
+            id: "colours",
+            summary: "64 px, the encoder of colours of another model, given with model.weights: minutes on two CPU cores",
+            toml: include_str!("../../presets/dino_wm/colours.toml"),
         },
         Preset {
             id: "paper",
@@ -84,20 +89,24 @@ impl Trainable for DinoWm {
     }
 
     fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
-        let from = &config.model.weights;
-        if from.is_empty() {
-            return Ok(self);
+        let model = &config.model;
+        if model.weights.is_empty() && matches!(model.encoder, BackboneConfig::Keypoints(_)) {
+            let fix = "give the weights.safetensors of a checkpoint whose encoder locates the same colours";
+            return Err(Error::config("model.weights", "is empty, and this encoder is not trained here", fix));
         }
-        let path = weights::locate(from, cache)?;
-        let found = weights::names::to_published(weights::read(&path)?, "", &path)?;
-        self.backbone = weights::fill(self.backbone, &found, &path, "model.encoder")?;
+        let inputs = (&model.encoder, &model.pixels());
+        self.backbone = weights::encoder::fill(self.backbone, inputs, &model.weights, cache)?;
         Ok(self)
+    }
+
+    fn fixed_part(&self, config: &DinoWmConfig) -> Option<FixedPart> {
+        Some(FixedPart { kernels: self.backbone.fixed_part(config.image)?, images: config.pixels() })
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
         let StepContext { config, dataset_info, key, device, training } = context;
         let (model, data) = (&config.model, &config.data);
-        let rgb = batch.get::<u8>(PIXELS)?;
+        let frames = Frames::of(&model.pixels(), batch, PIXELS)?;
         let columns: Result<Vec<Tensor<3>>> = model
             .columns
             .iter()
@@ -108,9 +117,9 @@ impl Trainable for DinoWm {
             .collect();
         let columns = columns?;
         shards::mean(batch.rows(), config.shards, |range| {
-            let bytes = rgb.len() / batch.rows();
+            let frames = frames.range(range.start * data.num_steps..range.end * data.num_steps);
             let clips = TrainBatch {
-                patches: model.image_patches(&rgb[range.start * bytes..range.end * bytes], device)?,
+                patches: frames.inputs(&model.pixels(), model.encoder.patch(), device)?,
                 columns: columns
                     .iter()
                     .map(|column| {

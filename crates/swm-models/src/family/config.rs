@@ -2,12 +2,12 @@
 
 use super::contract::{ModelFamily, OnlineRun, TrainRun};
 use crate::online::OnlineSummary;
-use crate::train::{TrainConfig, TrainOptions, TrainSummary, TrainingPlan, begin, train};
+use crate::train::{TrainConfig, TrainOptions, TrainSummary, TrainingPlan, begin, check_data, train};
 use serde_json::{Value, json};
 use std::path::Path;
 use std::sync::Arc;
-use swm_core::Result;
 use swm_core::run::Control;
+use swm_core::{Result, Schema};
 use swm_data::Reader;
 
 /// A complete training configuration of any family.
@@ -32,6 +32,18 @@ pub trait TrainableConfig {
 
     /// Returns the side of the model's square images in pixels; `None` for a state-only model.
     fn image_size(&self) -> Option<usize>;
+
+    /// Checks that a dataset with the columns of `schema` fits the model, as far as the columns tell.
+    ///
+    /// # Errors
+    /// When a column that the model reads is missing, or has another type or shape.
+    fn check_columns(&self, schema: &Schema) -> Result<()>;
+
+    /// Checks the dataset of a training, as far as it can be checked before there is a folder of the run.
+    ///
+    /// # Errors
+    /// When the dataset does not fit the model, or does not fill a batch.
+    fn check_data(&self, run: &TrainRun<'_>) -> Result<()>;
 
     /// Trains by acting in environments; `None` for a family that trains on datasets only.
     ///
@@ -78,6 +90,14 @@ impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
 
     fn image_size(&self) -> Option<usize> {
         M::image_size(&self.model)
+    }
+
+    fn check_columns(&self, schema: &Schema) -> Result<()> {
+        M::loader_config(self, schema).map(drop)
+    }
+
+    fn check_data(&self, run: &TrainRun<'_>) -> Result<()> {
+        check_data(self, &run.reader)
     }
 
     fn train_online(&self, run: OnlineRun<'_>, control: &mut Control<'_>) -> Option<Result<OnlineSummary>> {

@@ -4,7 +4,7 @@ use super::config::TrainableConfig;
 use super::contract::ModelFamily;
 use super::loaded::LoadedModel;
 use crate::checkpoint::Checkpoint;
-use crate::stored::StoredCheckpoint;
+use crate::stored::{StoredCheckpoint, write_unused};
 use crate::train::{DatasetInfo, Preset, TrainConfig};
 use burn::tensor::Device;
 use std::path::Path;
@@ -34,8 +34,8 @@ pub struct FamilyEntry {
     /// Loads a stored checkpoint.
     pub load: fn(&StoredCheckpoint, &Device) -> Result<Box<dyn LoadedModel>>,
     /// Converts a checkpoint of the reference implementation (`weights.pt` and `config.json` in the first folder),
-    /// which was trained on the given dataset, into a checkpoint in the last folder; returns the hash of the weights.
-    /// `None` if the reference implementation has no such family.
+    /// which was trained on the given dataset, into a checkpoint in the last folder, which holds none; returns the hash
+    /// of the weights. `None` if the reference implementation has no such family.
     pub import: fn(&Path, &dyn Reader, &Path) -> Option<Result<String>>,
 }
 
@@ -67,5 +67,5 @@ fn import<M: ModelFamily>(from: &Path, reader: &dyn Reader, out: &Path) -> Optio
         Ok(dataset_info) => dataset_info,
         Err(error) => return Some(Err(error)),
     };
-    Some(M::import(from, dataset_info)?.and_then(|mut checkpoint| checkpoint.save_to(out)))
+    Some(M::import(from, dataset_info)?.and_then(|mut checkpoint| write_unused(out, || checkpoint.save_to(out))))
 }

@@ -6,7 +6,7 @@ use super::model::{Gcbc, Gciql, Gcivl};
 use super::policy::Actor;
 use super::step::{Clips, ENCODER, Relabelled};
 use crate::checkpoint::Checkpoint;
-use crate::nn::{Backbone, BackboneConfig, DropoutRng, Init, Named, parameters};
+use crate::nn::{BackboneConfig, DropoutRng, Init, Named};
 use crate::pixels::{Frames, ImageNormalization};
 use crate::train::{
     DatasetInfo, FixedPart, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards,
@@ -119,7 +119,8 @@ impl Trainable for Gcbc {
     }
 
     fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
-        self.encoder = with_weights(self.encoder, &config.model.weights, cache)?;
+        let inputs = (&config.model.encoder, &config.model.pixels());
+        self.encoder = weights::encoder::fill(self.encoder, inputs, &config.model.weights, cache)?;
         Ok(self)
     }
 
@@ -199,7 +200,8 @@ macro_rules! value_learner {
             }
 
             fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
-                self.encoder = with_weights(self.encoder, &config.model.weights, cache)?;
+                let inputs = (&config.model.encoder, &config.model.pixels());
+        self.encoder = weights::encoder::fill(self.encoder, inputs, &config.model.weights, cache)?;
                 Ok(self)
             }
 
@@ -244,21 +246,6 @@ value_learner!(
     "goal-conditioned implicit Q-learning: critic and values, advantage-weighted policy regression",
     [value_predictor, critic_predictor]
 );
-
-/// Returns the encoder with the weights in the file or repository `from`, which holds an encoder or a model with an
-/// encoder. Returns the encoder unchanged if `from` is empty.
-fn with_weights(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
-    if from.is_empty() {
-        return Ok(encoder);
-    }
-    let path = weights::locate(from, cache)?;
-    let mut found = weights::names::to_published(weights::read(&path)?, "", &path)?;
-    if !parameters::shapes(&encoder).keys().all(|name| found.contains_key(name)) {
-        let encoder_weight = |(name, weight): (String, _)| Some((name.strip_prefix("encoder.")?.to_owned(), weight));
-        found = found.into_iter().filter_map(encoder_weight).collect();
-    }
-    weights::fill(encoder, &found, &path, "model.encoder")
-}
 
 /// Returns the parameter group of a weight: one group per network, whose gradients are clipped separately, because the
 /// published scripts have one optimizer per network.

@@ -2,7 +2,7 @@
 //! because its network is trained on the latents of another checkpoint.
 
 use super::checkpoint::FAMILY;
-use super::{InverseCheckpoint, InverseConfig, InversePolicy, train};
+use super::{InverseCheckpoint, InverseConfig, InversePolicy, check_data, train};
 use crate::checkpoint::Checkpoint;
 use crate::family::{CheckpointInfo, FamilyEntry, LoadedModel, OnlineRun, TrainRun, TrainableConfig};
 use crate::lewm::Lewm;
@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::run::Control;
-use swm_core::{EnvSpec, Error, Policy, Result};
+use swm_core::{EnvSpec, Error, Policy, Result, Schema};
 use swm_data::Reader;
 
 /// The registry row of inverse dynamics.
@@ -54,18 +54,20 @@ impl TrainableConfig for InverseConfig {
         None
     }
 
+    /// The encoder's checkpoint, which is opened later, decides which columns fit.
+    fn check_columns(&self, _: &Schema) -> Result<()> {
+        Ok(())
+    }
+
+    fn check_data(&self, run: &TrainRun<'_>) -> Result<()> {
+        check_data(self, &world_model(run)?, &run.reader)
+    }
+
     fn train_online(&self, _: OnlineRun<'_>, _: &mut Control<'_>) -> Option<Result<OnlineSummary>> {
         None
     }
 
     fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary> {
-        let Some(encoder) = run.encoder else {
-            return Err(Error::config(
-                "--encoder",
-                "an inverse-dynamics policy uses the encoder of another model",
-                "name a checkpoint with --encoder (`swm checkpoints` lists them)",
-            ));
-        };
         if run.options.resume {
             return Err(Error::config(
                 "--resume",
@@ -73,8 +75,7 @@ impl TrainableConfig for InverseConfig {
                 "leave out --resume and choose another --output",
             ));
         }
-        let world_model = Checkpoint::<Lewm>::load(encoder, &run.options.device)?;
-        train(self, &world_model, run.reader, run.out, run.options.threads, control)
+        train(self, &world_model(&run)?, run.reader, run.out, run.options.threads, control)
     }
 
     fn begin(
@@ -86,6 +87,21 @@ impl TrainableConfig for InverseConfig {
     ) -> Option<Result<TrainingPlan>> {
         None
     }
+}
+
+/// Loads the checkpoint whose encoder a training uses.
+///
+/// # Errors
+/// When none is named, or it cannot be loaded.
+fn world_model(run: &TrainRun<'_>) -> Result<Checkpoint<Lewm>> {
+    let Some(encoder) = run.encoder else {
+        return Err(Error::config(
+            "--encoder",
+            "an inverse-dynamics policy uses the encoder of another model",
+            "name a checkpoint with --encoder (`swm checkpoints` lists them)",
+        ));
+    };
+    Checkpoint::load(encoder, &run.options.device)
 }
 
 impl LoadedModel for InverseCheckpoint {

@@ -14,4 +14,4 @@ mod train;
 pub use checkpoint::InverseCheckpoint;
 pub use family::ENTRY;
 pub use policy::InversePolicy;
-pub use train::{InverseConfig, train};
+pub use train::{InverseConfig, check_data, train};

@@ -105,15 +105,18 @@ pub fn train(
     threads: usize,
     control: &mut Control<'_>,
 ) -> Result<TrainSummary> {
-    let _lock = Lock::folder(out)?;
-    if Checkpoint::<Lewm>::exists(out) {
-        return Err(Error::config(
+    let check_unused = || match Checkpoint::<Lewm>::exists(out) {
+        true => Err(Error::config(
             out.display().to_string(),
             "holds a training run already",
             "choose another folder, or remove it",
-        ));
-    }
-    pixels::check(&world_model.config.model, reader.schema(), PIXELS)?;
+        )),
+        false => Ok(()),
+    };
+    check_unused()?;
+    check_data(config, world_model, &reader)?;
+    let _lock = Lock::folder(out)?;
+    check_unused()?;
     swm_core::pool::threads(threads)?.install(|| run(config, world_model, reader, out, control))
 }
 
@@ -184,6 +187,15 @@ fn run(
         data_wait: waited / seconds,
         seconds,
     })
+}
+
+/// Checks that a dataset has the images of a world model and fills a batch.
+///
+/// # Errors
+/// When it does not.
+pub fn check_data(config: &InverseConfig, world_model: &Checkpoint<Lewm>, reader: &Arc<dyn Reader>) -> Result<()> {
+    pixels::check(&world_model.config.model, reader.schema(), PIXELS)?;
+    loader(config, world_model.config.data.frameskip, Arc::clone(reader)).map(drop)
 }
 
 fn manifest(config: &InverseConfig, world_model: &Checkpoint<Lewm>, reader: &dyn Reader) -> Result<Manifest> {

@@ -52,6 +52,9 @@ struct Running {
 /// The saved state of a [`Collector`], which [`Collector::restore`] reads.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct CollectorState {
+    /// The time limit of the episodes; `None` in the data of earlier programs.
+    #[serde(default)]
+    pub(super) max_steps: Option<usize>,
     steps: usize,
     next: u64,
     /// The index and the actions of every running episode; the environments are restored by repeating the actions.
@@ -205,12 +208,18 @@ impl Collector {
     pub fn state(&self, memory: Vec<Vec<f32>>) -> CollectorState {
         let running = self.running.iter().map(|running| (running.episode, running.actions.clone()));
         CollectorState {
+            max_steps: Some(self.pool.max_episode_steps()),
             steps: self.steps,
             next: self.next,
             running: running.collect(),
             returns: self.returns.clone(),
             memory,
         }
+    }
+
+    /// The time limit of the episodes, in steps.
+    pub fn max_episode_steps(&self) -> usize {
+        self.pool.max_episode_steps()
     }
 
     /// Restores the state of a collector with the same key: repeats the actions of the running episodes.

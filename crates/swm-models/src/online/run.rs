@@ -11,7 +11,7 @@ use crate::train::learner::{self, DynLearner, Learner, Update};
 use crate::train::metrics::Metrics;
 use crate::train::run::STAGE;
 use crate::train::run_state::is_due;
-use crate::train::{DatasetInfo, TrainConfig, TrainOptions, failed_batch, log};
+use crate::train::{DatasetInfo, TrainConfig, TrainOptions, failed_batch, log, resume};
 use serde::Serialize;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -243,6 +243,8 @@ impl Data {
         match &saved {
             Some(folder) => {
                 let state = read_collector(folder)?;
+                let run = folder.parent().unwrap_or(folder);
+                resume::check_same_time_limit(run, state.max_steps, collector.max_episode_steps())?;
                 collector.restore(&state)?;
                 memory = state.memory;
             }

@@ -1,6 +1,7 @@
 //! Planning by what a probe reads from latents, instead of by their distance: [`StateProbe`], [`ProbedLatents`], [`ProbedCost`].
 
 use super::ridge::{Ridge, mean_and_std};
+use super::samples::Spreads;
 use super::state::{Network, scores};
 use super::targets::Targets;
 use super::{Score, StateConfig};
@@ -115,11 +116,13 @@ fn tables(
     names.extend(columns.iter().filter(|name| !predictor.columns().contains(name)).cloned());
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let (mut x, mut y) = (vec![], vec![]);
+    let mut spreads = Spreads::new(columns);
     for ranges in ranges.chunks(BLOCK) {
         control.check()?;
         let batch = reader.read(&names, ranges)?;
         let mut latents = vec![0.0; batch.rows() * predictor.latent_dim()];
         predictor.encode(&batch, &mut latents)?;
+        spreads.add(&batch)?;
         let values: Vec<Vec<f32>> = columns.iter().map(|name| batch.to_f32(name)).collect::<Result<_>>()?;
         let width = |values: &Vec<f32>| values.len() / batch.rows();
         let row = |row: usize| values.iter().flat_map(move |values| &values[row * width(values)..][..width(values)]);
@@ -132,6 +135,9 @@ fn tables(
                 y.extend_from_slice(target);
             }
         }
+    }
+    if part == Part::Train {
+        spreads.check()?;
     }
     if y.len() < 2 * targets.list.len() {
         let problem = format!("fewer than two of its rows have finite values in {}", names.join(", "));

@@ -5,6 +5,7 @@ use crate::pixels;
 use rand::Rng as _;
 use rayon::prelude::*;
 use swm_core::columns::PIXELS;
+use swm_core::precision::Spread;
 use swm_core::{Batch, Error, Key, Result, limits};
 use swm_data::{Part, Reader, Split, StepRange};
 
@@ -20,6 +21,45 @@ pub(super) struct Samples {
     pub targets: Vec<f32>,
 }
 
+/// The spreads of the elements of the columns that a probe reads.
+pub(super) struct Spreads<'a>(Vec<(&'a str, Vec<Spread>)>);
+
+impl<'a> Spreads<'a> {
+    /// Spreads of columns of which no value is known.
+    pub fn new(columns: &'a [String]) -> Self {
+        Self(columns.iter().map(|column| (column.as_str(), vec![])).collect())
+    }
+
+    /// Adds the values of a batch.
+    ///
+    /// # Errors
+    /// When the batch lacks a column.
+    pub fn add(&mut self, batch: &Batch) -> Result<()> {
+        for (column, spreads) in &mut self.0 {
+            if !Spread::is_needed(batch.schema().column(column)?.dtype) {
+                continue;
+            }
+            for row in 0..batch.rows() {
+                let values = batch.row(row).to_f64(column)?;
+                spreads.resize(values.len(), Spread::default());
+                spreads.iter_mut().zip(values).for_each(|(spread, value)| spread.add(value));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that single precision, in which probes compute, tells the values of every element apart.
+    ///
+    /// # Errors
+    /// As [`Spread::check`].
+    pub fn check(&self) -> Result<()> {
+        let elements = self.0.iter().flat_map(|(column, spreads)| {
+            spreads.iter().enumerate().map(move |(index, spread)| spread.check(column, index))
+        });
+        elements.collect()
+    }
+}
+
 /// The number of frames that are read and encoded together: a constant, so that latents do not depend on the number of
 /// threads.
 const BLOCK_FRAMES: usize = 64;
@@ -31,7 +71,8 @@ const MAX_ELEMENTS: usize = 1 << 27;
 /// in stored order. Frames whose columns are not finite are skipped.
 ///
 /// # Errors
-/// When a column is missing, images have another size than the encoder's, or fewer than two frames are left.
+/// When a column is missing, single precision does not tell its values apart, images have another size than the encoder's, or
+/// fewer than two frames are left.
 pub(super) fn sample(
     encoder: &dyn ImageEncoder,
     reader: &dyn Reader,
@@ -60,6 +101,7 @@ pub(super) fn sample(
         }
     }
     let mut samples = Samples { count: 0, latents: vec![], images: vec![], targets: vec![] };
+    let mut spreads = Spreads::new(columns);
     // Several blocks are read and encoded in parallel.
     for blocks in rows.chunks(BLOCK_FRAMES * 16) {
         let encoded: Result<Vec<(Vec<f32>, Batch)>> = blocks
@@ -70,8 +112,13 @@ pub(super) fn sample(
             })
             .collect();
         for (latents, batch) in encoded? {
+            spreads.add(&batch)?;
             samples.add(encoder, columns, keep_images, &latents, &batch)?;
         }
+    }
+    // The standard deviation of a small part may be small.
+    if part == Part::Train {
+        spreads.check()?;
     }
     if samples.count < 2 {
         return Err(Error::config(
@@ -129,4 +176,30 @@ fn choose(rows: Vec<StepRange>, count: usize, key: Key) -> Vec<StepRange> {
         }
     }
     chosen.into_iter().map(|index| rows[index]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use swm_core::{ColumnSpec, DType, Schema};
+
+    #[test]
+    fn columns_that_single_precision_does_not_tell_apart_are_refused() {
+        let doubles = |name: &str| ColumnSpec::new(name, DType::Float64, [2]);
+        let schema = Schema::new([doubles("near"), doubles("far")]).expect("a schema");
+        let mut batch = Batch::zeros(&schema, 8);
+        for (name, offset) in [("near", 0.0), ("far", 1e9)] {
+            let values = batch.get_mut::<f64>(name).expect("a column of doubles");
+            values.iter_mut().enumerate().for_each(|(i, value)| *value = i as f64 + offset * (i % 2) as f64);
+        }
+        let check = |names: &[&str]| {
+            let names: Vec<String> = names.iter().map(|&name| name.to_owned()).collect();
+            let mut spreads = Spreads::new(&names);
+            spreads.add(&batch)?;
+            spreads.check()
+        };
+        check(&["near"]).expect("moderate values");
+        let error = check(&["near", "far"]).expect_err("an offset of 1e9").to_string();
+        assert!(error.contains("column 'far', element 1"), "{error}");
+    }
 }

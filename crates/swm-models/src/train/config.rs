@@ -160,7 +160,10 @@ impl<M: Trainable> TrainConfig<M> {
         ])?;
         check_finite(self)?;
         self.loop_config().check()?;
-        self.online.as_ref().map_or(Ok(()), OnlineConfig::check)?;
+        if let Some(online) = &self.online {
+            online.check()?;
+            self.schedule.check_warmup()?;
+        }
         M::check(self)
     }
 

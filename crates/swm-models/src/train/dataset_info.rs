@@ -4,7 +4,7 @@ use crate::nn::parameters::Named;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use swm_core::columns::{ACTION, PIXELS, REWARD, TERMINATED};
-use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Space};
+use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Schema, Space, precision};
 use swm_data::{Reader, column_stats};
 use swm_plan::ActionScale;
 
@@ -42,7 +42,7 @@ impl ColumnInfo {
 
     /// The standard deviation, replaced by 1 for elements that are constant, so that it can be a divisor.
     pub fn spread(&self) -> Vec<f64> {
-        self.std.iter().map(|&std| if std > 1e-6 { std } else { 1.0 }).collect()
+        self.std.iter().map(|&std| if std > precision::CONSTANT { std } else { 1.0 }).collect()
     }
 
     /// Computes the statistics of a column, which must be finite.
@@ -65,6 +65,11 @@ impl ColumnInfo {
             return Err(Error::config(format!("column '{ACTION}' of the training data"), given, fix));
         }
         Ok(Self { shape: spec.shape.clone(), mean: stats.mean, std: stats.std, min: stats.min, max: stats.max })
+    }
+
+    /// The largest magnitude of an element.
+    fn magnitude(&self, element: usize) -> f64 {
+        self.min[element].abs().max(self.max[element].abs())
     }
 
     /// Returns statistics with which scaling does not change the column.
@@ -100,6 +105,23 @@ impl DatasetInfo {
                     given,
                     "give one of each for every element",
                 ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that models, which compute with single precision, can tell the values of the columns apart. `columns` are those that
+    /// the model reads.
+    ///
+    /// # Errors
+    /// When a column has values beyond single precision, or values that are far larger than their deviation; the error names it.
+    pub fn check_precision(&self, schema: &Schema, columns: &[String]) -> Result<()> {
+        for (name, column) in columns.iter().filter_map(|name| Some((name, self.columns.get(name)?))) {
+            let Ok(&ColumnSpec { dtype, .. }) = schema.column(name) else { continue };
+            for element in 0..column.dim() {
+                let largest = column.magnitude(element);
+                let error = precision::rounding(dtype, largest);
+                precision::check(name, element, largest, column.std[element], error)?;
             }
         }
         Ok(())

@@ -126,6 +126,10 @@ impl Reader for FixedFeatures {
         self.inner.irregularities()
     }
 
+    fn check_files(&self) -> Result<()> {
+        self.inner.check_files()
+    }
+
     fn sources(&self) -> Vec<PathBuf> {
         self.inner.sources()
     }

@@ -100,6 +100,9 @@ impl<'a, M: Trainable> Learner<'a, M> {
         let device = &options.device;
         let (checkpoint, stored) = Checkpoint::<M>::load_to_resume(out, device)?;
         resume::check_same_run(out, &checkpoint.manifest, manifest)?;
+        if let Some((step, _)) = stored.state.best {
+            resume::check_best(&out.join(BEST), step)?;
+        }
         let mut optimizer = AdamW::new(config.optim.clone());
         optimizer.restore(stored.state.step, stored.moments, device);
         let (model, average) = match stored.raw {

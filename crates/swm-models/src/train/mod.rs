@@ -36,7 +36,7 @@ pub use fixed_features::FixedPart;
 pub use optim::{AdamW, OptimConfig, ParameterGroup};
 pub use options::{TrainOptions, TrainSummary};
 pub use presets::Preset;
-pub use run::{TrainingPlan, begin, train};
+pub use run::{TrainingPlan, begin, check_data, train};
 pub use schedule::ScheduleConfig;
 pub(crate) use split::episodes;
 pub use step_output::StepOutput;

@@ -2,7 +2,7 @@
 //! replaces nothing that no run wrote.
 
 use crate::run_folder::{CONFIG, FOLDER, NEW_FOLDER, OLD_FOLDER};
-use crate::stored::{is_begun, is_event_file, is_occupied, locate};
+use crate::stored::{faults, is_begun, is_event_file, is_occupied, locate};
 use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;
@@ -75,19 +75,51 @@ fn is_log(path: &Path, has_events: bool) -> bool {
 /// When the configuration differs, with the settings that differ and their values, or else when the data differ.
 pub(crate) fn check_same_run(path: &Path, stored: &Manifest, requested: &Manifest) -> Result<()> {
     // Other data may also change the configuration, by the colours that were found in it.
-    let problem = if stored.hashes.get("dataset") != requested.hashes.get("dataset") {
-        "the stored run was trained on other data".to_owned()
+    if stored.hashes.get("dataset") != requested.hashes.get("dataset") {
+        Err(differs(path, "was trained on other data", "the configuration and the data"))
     } else if stored.config != requested.config {
         let differing = differences("", &stored.config, &requested.config);
-        format!("the stored run has another configuration ({})", differing.join(", "))
+        let problem = format!("has another configuration ({})", differing.join(", "));
+        Err(differs(path, &problem, "the configuration and the data"))
     } else {
-        return Ok(());
+        Ok(())
+    }
+}
+
+/// Checks that a stored online run has the requested time limit. `stored` is `None` for a run of an earlier program, which is
+/// continued with any.
+///
+/// # Errors
+/// When the time limit differs, with both values.
+pub(crate) fn check_same_time_limit(path: &Path, stored: Option<usize>, requested: usize) -> Result<()> {
+    match stored.filter(|stored| *stored != requested) {
+        None => Ok(()),
+        Some(stored) => {
+            let problem = format!("has another time limit of episodes (stored {stored} steps, requested {requested})");
+            Err(differs(path, &problem, "the time limit"))
+        }
+    }
+}
+
+/// The error for a run that differs from the requested one.
+fn differs(path: &Path, problem: &str, of: &str) -> Error {
+    let fix = format!("continue with {of} of the stored run, or choose another folder");
+    Error::config(path.display().to_string(), format!("the stored run {problem}"), fix)
+}
+
+/// Checks that the best checkpoint in the folder of a run, which the run compares the next ones with, is there and unchanged.
+///
+/// # Errors
+/// When it is missing or damaged; `step` is that of the best weights.
+pub(crate) fn check_best(best: &Path, step: usize) -> Result<()> {
+    let fault = match faults(best) {
+        Ok(faults) if faults.is_empty() => return Ok(()),
+        _ if locate(best).is_none() => "are missing".to_owned(),
+        Ok(faults) => format!("are damaged: {}", faults.join("; ")),
+        Err(error) => format!("are damaged: {error}"),
     };
-    Err(Error::config(
-        path.display().to_string(),
-        problem,
-        "continue with the configuration and the data of the stored run, or choose another folder",
-    ))
+    let problem = format!("the best weights of the run, those of step {step}, {fault}");
+    Err(Error::corrupt(best, problem, "copy the folder back from where you have it, or train again in another folder"))
 }
 
 /// The keys in which two configurations differ, with both values.

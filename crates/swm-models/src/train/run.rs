@@ -51,6 +51,7 @@ pub fn train<M: Trainable>(
     threads.install(|| {
         let config = &with_colours(config, &*reader)?;
         let inputs = Inputs::of(config, &*reader, options)?;
+        check_data(config, &reader)?;
         let _lock = Lock::folder(out)?;
         let (mut learner, loader) = inputs.learner(config, out, options)?;
         let part = learner.model().fixed_part(&config.model);
@@ -78,23 +79,9 @@ pub fn begin<M: Trainable>(
 ) -> Result<TrainingPlan> {
     let config = &with_colours(config, &*reader)?;
     let inputs = Inputs::of(config, &*reader, options)?;
+    let (training, validation) = loadable(&config.loop_config(), &inputs.loader, &reader)?;
     let _lock = Lock::folder(out)?;
-    let (learner, loader) = inputs.learner(config, out, options)?;
-    let settings = config.loop_config();
-    let part = |part| {
-        let batches = batches(&settings, loader.clone(), part, &*reader)?;
-        // Refuses what no loader can load, before there is a checkpoint.
-        let loaded = Loader::new(Arc::clone(&reader), batches.clone()).map(|_| batches);
-        loaded.map_err(|error| match part {
-            Part::Train => error,
-            _ => {
-                let fix = "collect more episodes, lower data.batch_size, or leave validation out (validation.every=0)";
-                Error::config("the episodes of validation", error.to_string(), fix)
-            }
-        })
-    };
-    let training = part(Part::Train)?;
-    let validation = if settings.validation.every > 0 { Some(part(Part::Validation)?) } else { None };
+    let (learner, _) = inputs.learner(config, out, options)?;
     if !Checkpoint::<M>::exists(out) {
         resume::check_new_run(out)?;
         record()?;
@@ -132,6 +119,7 @@ impl Inputs {
         let goals = loader.goals.iter().flat_map(|goal| &goal.columns);
         let columns: Vec<String> = loader.clip.columns.iter().chain(goals).cloned().collect();
         let dataset_info = DatasetInfo::from_reader(reader, &columns, M::BOUNDED_ACTIONS)?;
+        dataset_info.check_precision(reader.schema(), &columns)?;
         let manifest = learner::manifest(config, reader.content_hash()?, &options.device);
         Ok(Self { loader, dataset_info, manifest })
     }
@@ -151,6 +139,36 @@ impl Inputs {
         };
         Ok((learner, loader))
     }
+}
+
+/// Checks that a dataset has the columns of a model and fills the batches of a training, before there is a folder of the run.
+///
+/// # Errors
+/// When a column is missing or has another shape, no episode is long enough for a clip, or the clips do not fill a batch.
+pub fn check_data<M: Trainable>(config: &TrainConfig<M>, reader: &Arc<dyn Reader>) -> Result<()> {
+    loadable(&config.loop_config(), &M::loader_config(config, reader.schema())?, reader).map(drop)
+}
+
+/// Returns the batches of training, and those of validation if there is one, after checking that a loader can load them.
+fn loadable(
+    config: &LoopConfig,
+    loader: &LoaderConfig,
+    reader: &Arc<dyn Reader>,
+) -> Result<(LoaderConfig, Option<LoaderConfig>)> {
+    let of = |part| {
+        let batches = batches(config, loader.clone(), part, &**reader)?;
+        let checked = LoaderConfig { threads: 0, ..batches.clone() };
+        Loader::new(Arc::clone(reader), checked).map(|_| batches)
+    };
+    let training = of(Part::Train)?;
+    if config.validation.every == 0 {
+        return Ok((training, None));
+    }
+    let validation = of(Part::Validation).map_err(|error| {
+        let fix = "collect more episodes, lower data.batch_size, or leave validation out (validation.every=0)";
+        Error::config("the episodes of validation", error.to_string(), fix)
+    })?;
+    Ok((training, Some(validation)))
 }
 
 /// Returns the batches of a part of the dataset.

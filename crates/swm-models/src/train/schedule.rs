@@ -31,6 +31,19 @@ impl ScheduleConfig {
         ))
     }
 
+    /// Checks that the warm-up ends before the run does. Presets for datasets keep their warm-up in short trials, so only
+    /// online configurations are checked.
+    ///
+    /// # Errors
+    /// When the warm-up has more steps than the run.
+    pub fn check_warmup(&self) -> Result<()> {
+        if self.warmup <= self.steps {
+            return Ok(());
+        }
+        let problem = format!("{} steps of warm-up, and schedule.steps is {}", self.warmup, self.steps);
+        Err(Error::config("schedule.warmup", problem, "lower schedule.warmup, or raise schedule.steps"))
+    }
+
     /// Returns the learning rate of a step (the first step is 0) as a fraction of the peak.
     ///
     /// The fraction of step `t` is `(t + 1) / warmup` during the warm-up, then `floor + (1 - floor) (1 + cos πp) / 2`
@@ -56,5 +69,19 @@ mod tests {
         assert!((schedule.lr_factor(9) - 1.0).abs() < 1e-12);
         assert!((schedule.lr_factor(60) - 0.55).abs() < 1e-12);
         assert!((schedule.lr_factor(110) - 0.1).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_warm_up_beyond_the_run_is_refused_online() {
+        let load = |settings: &[&str]| {
+            let settings: Vec<String> = settings.iter().map(|text| (*text).to_owned()).collect();
+            (crate::FAMILIES.get("sac").expect("sac").config)("tiny", &settings).map(drop)
+        };
+        load(&["schedule.steps=10", "schedule.warmup=10"]).expect("a warm-up as long as the run");
+        let error = load(&["schedule.steps=10", "schedule.warmup=11"]).expect_err("a longer warm-up").to_string();
+        assert!(error.contains("11 steps of warm-up") && error.contains("schedule.steps is 10"), "{error}");
+        (crate::FAMILIES.get("lewm").expect("lewm").config)("tiny", &["schedule.steps=2".to_owned()])
+            .map(drop)
+            .expect("a short trial on a dataset");
     }
 }

@@ -5,10 +5,12 @@
 //!   weights of a repository.
 //! - [`torch::write`]: a state dict that `torch.load(weights_only=True)` reads.
 //! - [`names`]: the names of a vision transformer's weights in versions of the Python package `transformers`.
+//! - [`encoder::fill`]: replaces the weights of an encoder by those of another model's encoder.
 //! - [`fill`]: replaces the weights of a module and reports weights that do not fit.
 //!
 //! Pickles are never executed: the reader accepts only the operations that describe tensors.
 
+pub(crate) mod encoder;
 pub mod hub;
 pub(crate) mod keys;
 pub mod names;

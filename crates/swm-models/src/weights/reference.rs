@@ -9,7 +9,8 @@ use crate::train::limits;
 use serde::Serialize;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Result, files};
+use swm_core::files::{self, Lock};
+use swm_core::{Error, Result};
 
 /// A checkpoint of the reference implementation.
 pub(crate) struct Reference {
@@ -24,6 +25,8 @@ pub(crate) struct Reference {
 }
 
 const CONFIG: &str = "config.json";
+/// The weights of a checkpoint that [`write`] writes.
+const EXPORTED_WEIGHTS: &str = "weights.pt";
 const TARGET: &str = "_target_";
 
 impl Reference {
@@ -182,12 +185,35 @@ fn only_weights(folder: &Path) -> Result<PathBuf> {
 }
 
 /// Writes a checkpoint that the reference's `load_pretrained` reads: `weights.pt` and `config.json`. Existing files are not
-/// replaced, because nothing in them shows which program wrote them.
+/// replaced, because nothing in them shows which program wrote them. What a killed export left unfinished is deleted.
 pub(crate) fn write(folder: &Path, config: &impl Serialize, weights: &Named<HostTensor>) -> Result<()> {
-    std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating a folder", error))?;
-    let (path, weights_path) = (folder.join(CONFIG), folder.join("weights.pt"));
+    let _lock = Lock::folder(folder)?;
+    let (path, weights_path) = (folder.join(CONFIG), folder.join(EXPORTED_WEIGHTS));
     [&path, &weights_path].into_iter().try_for_each(|path| files::check_free(path))?;
+    files::delete_temporary(folder, |name| name == CONFIG || name == EXPORTED_WEIGHTS)?;
     torch::write(&weights_path, weights)?;
     let text = serde_json::to_string_pretty(config).map_err(|error| Error::external("writing JSON", error))?;
     files::write(&path, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exports_replace_no_file_but_what_a_killed_one_left_unfinished() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let [unfinished, weights] = [".weights.pt.7.tmp", "weights.pt"].map(|name| folder.path().join(name));
+        std::fs::write(&unfinished, "PK").expect("what a kill leaves");
+        let tensors = Named::from([("a".to_owned(), HostTensor { shape: vec![1], values: vec![0.5] })]);
+        let held = Lock::folder(folder.path()).expect("locking the folder as another export does");
+        let error = write(folder.path(), &serde_json::json!({}), &tensors).expect_err("another export").to_string();
+        assert!(error.contains("another process writes to it"), "{error}");
+        assert_eq!(std::fs::read_dir(folder.path()).expect("listing the folder").count(), 1, "nothing is written");
+        drop(held);
+        write(folder.path(), &serde_json::json!({}), &tensors).expect("an export");
+        assert!(!unfinished.exists() && weights.is_file());
+        let error = write(folder.path(), &serde_json::json!({}), &tensors).expect_err("existing files").to_string();
+        assert!(error.contains("config.json") && error.contains("not replaced"), "{error}");
+    }
 }

@@ -17,11 +17,9 @@ pub const BATCHES_TRACKED: &str = "num_batches_tracked";
 /// # Errors
 /// When writing fails.
 pub fn write(path: &Path, tensors: &Named<HostTensor>) -> Result<()> {
-    let failed = |error: std::io::Error| Error::io(path, "writing weights", error);
-    let file = files::open_to_write(path, false)?;
-    let mut file = std::io::BufWriter::new(file);
-    archive(&mut file, tensors).map_err(|error| failed(error.into()))?;
-    file.flush().map_err(failed)
+    let mut bytes = std::io::Cursor::new(vec![]);
+    archive(&mut bytes, tensors).map_err(|error| Error::io(path, "writing weights", error.into()))?;
+    files::write(path, &bytes.into_inner())
 }
 
 fn archive(file: impl Write + Seek, tensors: &Named<HostTensor>) -> zip::result::ZipResult<()> {

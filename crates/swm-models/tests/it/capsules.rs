@@ -6,10 +6,11 @@ use serde_json::{Value, json};
 use std::fs;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Schema};
+use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Key, Result, Schema};
 use swm_models::capsule::{self, Capsule, Description, Evaluation, MAX_BYTES, Reference, reference};
 use swm_models::dino_wm::DinoWm;
 use swm_models::lewm::Lewm;
+use swm_models::nn::Init;
 use swm_models::nn::parameters::HostTensor;
 use swm_models::{Checkpoint, FAMILIES, StoredCheckpoint, Trainable, load_stored};
 
@@ -90,6 +91,24 @@ fn capsule_holds_the_model_and_its_outputs() {
     let exported = StoredCheckpoint::read(&run).expect("a checkpoint");
     assert_eq!(exported.weights().expect("weights"), capsule.weights);
     assert!(capsule::export(&again, &run).expect_err("an existing checkpoint").to_string().contains("already"));
+}
+
+#[test]
+fn only_the_capsule_of_the_same_model_is_replaced() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("model.safetensors");
+    let mut other = model::<Lewm>(&[SMALL, SMALL_PREDICTOR]);
+    (other.manifest.seed, other.config.seed) = (1, 1);
+    let init = Init::new(Key::new(1), &Device::flex());
+    other.model = Lewm::new(&other.config, &other.dataset_info, &init).expect("a model");
+    // As two commands that both found no file: neither looks at it before it writes.
+    lewm().write_own(&path).expect("a new capsule");
+    let bytes = fs::read(&path).expect("a file");
+    let error = packed(other).write_own(&path).expect_err("another model").to_string();
+    assert!(error.contains("holds another model"), "{error}");
+    lewm().write_own(&path).expect("the same model");
+    assert_eq!(fs::read(&path).expect("a file"), bytes);
+    assert_eq!(fs::read_dir(folder.path()).expect("a folder").count(), 1, "no temporary file is left");
 }
 
 #[test]

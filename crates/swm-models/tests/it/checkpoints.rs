@@ -51,6 +51,15 @@ fn damaged_checkpoints_are_refused() {
     assert!(message(&trained).contains("config.json") && message(&trained).contains("the hash differs"));
     std::fs::write(&config_file, &original).expect("writing the file");
 
+    let manifest_file = inner.join("manifest.json");
+    let manifest = std::fs::read(&manifest_file).expect("reading the file");
+    edit(&manifest_file, |file| file["config"]["optim"]["lr"] = 0.5.into());
+    assert!(message(&trained).contains("another value of 'optim.lr'"), "{}", message(&trained));
+    // A setting that did not exist yet when the checkpoint was written.
+    edit(&manifest_file, |file| drop(file["config"]["optim"].as_object_mut().expect("a table").remove("lr")));
+    load(&trained).expect("a manifest with fewer settings");
+    std::fs::write(&manifest_file, &manifest).expect("writing the file");
+
     // If a process is killed between the two renames of a save, the folder `.checkpoint.old` remains.
     std::fs::rename(&inner, trained.join(".checkpoint.old")).expect("renaming the folder");
     load(&trained).expect("loading the old checkpoint");

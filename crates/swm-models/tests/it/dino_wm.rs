@@ -4,12 +4,13 @@
 use crate::dots::{Dots, SIDE, draw};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use swm_core::run::Control;
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Key, Manifest, Result, Schema};
 use swm_models::dino_wm::{DinoWm, DinoWmCost};
-use swm_models::nn::{Init, parameters};
+use swm_models::nn::{BackboneConfig, Init, parameters};
 use swm_models::train::DatasetInfo;
-use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
+use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, Trainable, train, weights};
 
 const ENVS: usize = 3;
 const SAMPLES: usize = 19;
@@ -68,6 +69,46 @@ fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
     let (before, after) = (parameters::values(&fresh), parameters::values(&loaded.model));
     for (name, value) in &before {
         assert_eq!(name.starts_with("backbone."), after[name] == *value, "{name}");
+    }
+}
+
+#[test]
+fn the_encoder_of_another_model_is_used_and_frames_are_encoded_once() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let other = crate::training::keypoints_config();
+    let lewm = folder.path().join("lewm");
+    train(&other, Arc::new(Dots::new(6, 0)), &lewm, &crate::options(), &mut Control::new()).expect("training LeWM");
+    let mut with_idm = crate::pldm::config(&[]).expect("loading the configuration");
+    with_idm.model.encoder = other.model.encoder.clone();
+    let pldm = folder.path().join("pldm");
+    train(&with_idm, Arc::new(Dots::new(6, 0)), &pldm, &crate::options(), &mut Control::new()).expect("training PLDM");
+    for (from, prefix) in [(lewm, "encoder."), (pldm, "model.encoder.")] {
+        let file = from.join("checkpoint/weights.safetensors");
+        let mut config = config(&[IMAGES]).expect("loading the configuration");
+        config.model.encoder = other.model.encoder.clone();
+        config.model.weights = file.display().to_string();
+        let (out, dots) = (from.join("dino"), Arc::new(Dots::new(6, 0)));
+        train(&config, Arc::<Dots>::clone(&dots), &out, &crate::options(), &mut Control::new()).expect("training");
+        assert_eq!(dots.frames_read.load(Ordering::Relaxed), 6 * 24);
+        let trained = Checkpoint::<DinoWm>::load(&out, &crate::device()).expect("loading the checkpoint").model;
+        let found = weights::read(&file).expect("reading the weights");
+        let frozen = parameters::values(&trained.backbone);
+        assert!(!frozen.is_empty());
+        for (name, value) in frozen {
+            assert_eq!(found[&format!("{prefix}{name}")], value, "{name}");
+        }
+        // The trained layers read other features than those they were trained with.
+        let BackboneConfig::Keypoints(keypoints) = &mut config.model.encoder else {
+            unreachable!("an encoder of keypoints")
+        };
+        keypoints.colours.reverse();
+        let refused = |config: &TrainConfig<DinoWm>| {
+            run(config, &from.join("refused"), 1).expect_err("other features").to_string()
+        };
+        let error = refused(&config);
+        assert!(error.contains("set model.encoder.keypoints.colours=[[1.0, 0.5, -1.0], "), "{error}");
+        config.model.weights.clear();
+        assert!(refused(&config).contains("model.weights"), "an encoder that nobody trains");
     }
 }
 

@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use swm_core::files::Lock;
 use swm_core::{Key, Manifest};
 use swm_models::dino_wm::DinoWm;
 use swm_models::gcrl::{Gcbc, Gciql, Gcivl};
@@ -17,7 +18,7 @@ use swm_models::pldm::{self, Pldm};
 use swm_models::sac::Sac;
 use swm_models::tdmpc2::Tdmpc2;
 use swm_models::train::{ColumnInfo, DatasetInfo};
-use swm_models::{Checkpoint, TrainConfig, TrainOptions, Trainable, checkpoint, dino_wm, weights};
+use swm_models::{Checkpoint, FAMILIES, TrainConfig, TrainOptions, Trainable, checkpoint, dino_wm, weights};
 use swm_plan::ActionScale;
 
 /// Settings without a limit: no size depends on them.
@@ -245,6 +246,23 @@ fn copied(family: &str) -> (tempfile::TempDir, PathBuf) {
     }
     let path = folder.path().to_owned();
     (folder, path)
+}
+
+#[test]
+fn import_replaces_no_checkpoint_and_keeps_other_writers_away() {
+    let (_folder, from) = copied("lewm");
+    let run = from.join("run");
+    let family = FAMILIES.get("lewm").expect("a family");
+    let dots = crate::dots::Dots::new(2, 0);
+    let import = || (family.import)(&from, &dots, &run).expect("a family of the reference");
+    let held = Lock::folder(&run).expect("locking the folder as another import does");
+    let error = import().expect_err("another process writes").to_string();
+    assert!(error.contains("another process writes to it"), "{error}");
+    drop(held);
+    import().expect("an import");
+    let error = import().expect_err("a second import").to_string();
+    assert!(error.contains("holds a checkpoint already"), "{error}");
+    assert_eq!(checkpoint::faults(&run).expect("a checkpoint"), [""; 0]);
 }
 
 #[test]

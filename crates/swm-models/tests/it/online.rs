@@ -4,7 +4,8 @@ use crate::training::stop_after;
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::run::Control;
-use swm_core::{EnvPool, Result};
+use swm_core::{Batch, ColumnSpec, DType, EnvPool, Result, Schema};
+use swm_data::{Constants, ReplayBuffer, WriteOptions};
 use swm_models::online::{Agent, OnlineSummary, train_online};
 use swm_models::sac::Sac;
 use swm_models::tdmpc2::Tdmpc2;
@@ -151,6 +152,93 @@ fn check_resuming<M: Agent>() {
         .expect_err("another configuration")
         .to_string();
     assert!(other.contains("optim.lr"), "{other}");
+}
+
+#[test]
+fn run_is_not_resumed_with_another_time_limit() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (config, out) = (config::<Sac>(&[]), folder.path());
+    run(&config, out, &crate::options(), 10).expect("training the model");
+    let options = TrainOptions { resume: true, ..crate::options() };
+    let resumed =
+        |limit| train_online(&config, &pools(PENDULUM, limit), out, &options, &mut stop_after(12)).map(|run| run.steps);
+    for (limit, steps) in [(Some(30), 30), (Some(10), 10), (None, 200)] {
+        let error = resumed(limit).expect_err("another time limit").to_string();
+        let expected = format!("another time limit of episodes (stored 20 steps, requested {steps})");
+        assert!(error.contains(&expected), "{error}");
+    }
+    // Earlier programs stored neither the time limit nor the hash.
+    let place = out.join("played-10/place.json");
+    let text = std::fs::read_to_string(&place).expect("reading the running episodes");
+    let text = text.lines().next().expect("a line").replace("\"max_steps\":20,", "");
+    assert!(!text.contains("max_steps"), "{text}");
+    std::fs::write(&place, text).expect("writing");
+    assert_eq!(resumed(Some(20)).expect("continuing the run"), 12);
+}
+
+#[test]
+fn run_whose_best_weights_are_missing_or_damaged_is_not_resumed() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (config, out) = (config::<Sac>(&[]), folder.path());
+    run(&config, out, &crate::options(), 10).expect("training the model");
+    let resume = TrainOptions { resume: true, ..crate::options() };
+    let refused = |fault: &str| {
+        let error = run(&config, out, &resume, 0).expect_err("it has no best weights").to_string();
+        assert!(error.contains(&format!("the best weights of the run, those of step 8, are {fault}")), "{error}");
+    };
+    let (best, moved) = (out.join("best"), out.join("moved"));
+    std::fs::rename(&best, &moved).expect("moving the best checkpoint");
+    refused("missing");
+    std::fs::rename(&moved, &best).expect("moving it back");
+    let weights = best.join("checkpoint/weights.safetensors");
+    let stored = std::fs::read(&weights).expect("reading the weights");
+    let mut changed = stored.clone();
+    *changed.last_mut().expect("a byte") ^= 1;
+    std::fs::write(&weights, changed).expect("changing the weights");
+    refused("damaged");
+    std::fs::write(&weights, stored).expect("restoring the weights");
+    assert_eq!(run(&config, out, &resume, 0).expect("continuing the run").steps, 24);
+}
+
+#[test]
+fn columns_that_single_precision_does_not_tell_apart_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let schema = Schema::new([
+        ColumnSpec::new("state", DType::Float64, [2]),
+        ColumnSpec::new("action", DType::Float32, [1]),
+        ColumnSpec::new("reward", DType::Float32, []),
+        ColumnSpec::new("terminated", DType::Bool, []),
+    ])
+    .expect("creating the schema");
+    let trained = |name: &str, value: &dyn Fn(usize) -> f64| {
+        let replay = ReplayBuffer::new(&schema, 1000).expect("a buffer");
+        for episode in 0..4 {
+            let mut rows = Batch::zeros(&schema, 20);
+            for step in 0..20 {
+                rows.row_mut(step).set(0, &[0.5, value(20 * episode + step)]);
+                rows.row_mut(step).set(1, &[if step == 19 { f32::NAN } else { (step as f32).sin() }]);
+            }
+            replay.add(&rows, &Constants::default()).expect("an episode");
+        }
+        let data = folder.path().join(format!("{name}.lance"));
+        replay.save(&data, WriteOptions::default()).expect("a dataset");
+        let (config, reader) = (config::<Tdmpc2>(&[]), swm_data::open(data).expect("a dataset"));
+        let out = folder.path().join(name);
+        train(&config, reader, &out, &crate::options(), &mut Control::new()).map(drop).map_err(|e| e.to_string())
+    };
+    let wave = |step: usize| (step as f64).sin();
+    for (name, value) in [
+        ("offset", &(|step: usize| f64::from(1 << 30) + wave(step)) as &dyn Fn(usize) -> f64),
+        ("huge", &|step: usize| if step == 7 { -1e39 } else { wave(step) }),
+    ] {
+        let error = trained(name, value).expect_err(name);
+        assert!(error.contains("column 'state'") && error.contains("element 1") && error.contains("offset"), "{error}");
+        assert!(!folder.path().join(name).exists());
+    }
+    // A body at rest, a counter, and a coordinate.
+    trained("rest", &|step: usize| 1.0 + 1e-5 * wave(step)).expect("a body at rest");
+    trained("counter", &|step: usize| 1e3 * step as f64).expect("a counter");
+    trained("far", &|step: usize| 100.0 + wave(step)).expect("a coordinate");
 }
 
 #[test]

@@ -80,6 +80,22 @@ fn resuming_a_run_that_ended_early_changes_nothing() {
 }
 
 #[test]
+fn run_whose_best_weights_are_missing_is_not_resumed() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let config = config(&["validation.every=1", "validation.batches=1", "data.hold_out=true"]);
+    let train = |options: &TrainOptions, stop_at| {
+        train(&config, Arc::new(Dots::new(40, 0)), folder.path(), options, &mut stop_after(stop_at))
+    };
+    train(&crate::options(), 2).expect("training the model");
+    std::fs::rename(folder.path().join("best"), folder.path().join("moved")).expect("moving the best checkpoint");
+    let resume = TrainOptions { resume: true, ..crate::options() };
+    let error = train(&resume, 0).expect_err("it has no best weights").to_string();
+    assert!(error.contains("the best weights of the run") && error.contains("are missing"), "{error}");
+    std::fs::rename(folder.path().join("moved"), folder.path().join("best")).expect("moving it back");
+    assert_eq!(train(&resume, 0).expect("continuing the run").steps, 10);
+}
+
+#[test]
 fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));

@@ -68,26 +68,13 @@ pub fn pack(args: &PackArgs, context: &Context) -> anyhow::Result<()> {
         trust: args.trust,
     };
     let packed = capsule::pack(&request, &run_options(ENVS, None, context), &mut control(context))?;
-    check_same_model(&args.output, &packed)?;
     let _lock = output_folder::claim_file(&args.output)?;
-    let hash = packed.write(&args.output)?;
+    let hash = packed.write_own(&args.output)?;
     if context.json {
         return emit_json(&json!({"path": args.output, "hash": hash, "weights": packed.weights_hash()}));
     }
     emit(&format!("{}\n", args.output.display()));
     Ok(())
-}
-
-/// Refuses to replace the capsule of another model.
-fn check_same_model(path: &Path, packed: &Capsule) -> Result<()> {
-    match Capsule::read(path) {
-        Ok(old) if !old.is_same_model(packed) => {
-            let problem = format!("it holds another model, with the weights {}", old.weights_hash());
-            let fix = "give another --output, or delete the file by hand";
-            Err(Error::config(path.display().to_string(), problem, fix))
-        }
-        _ => Ok(()),
-    }
 }
 
 /// Verifies the behaviour of a capsule.

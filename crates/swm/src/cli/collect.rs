@@ -171,7 +171,11 @@ impl<'a> Collection<'a> {
         let Some(env) = &args.env else {
             return Err(Error::config("ENV", "no environment is given", "name one; `swm envs` lists them"));
         };
-        args.codec.check_format(location, args.format.as_deref())?;
+        // A dataset may have been begun with a codec that has no effect, and is continued with the same settings.
+        let continues = args.resume && matches!(location, Location::Path(path) if path.exists());
+        if !continues {
+            args.codec.check_format(location, args.format.as_deref())?;
+        }
         Ok(Self {
             env: crate::env(env, &Origin::User)?,
             location,
@@ -205,18 +209,20 @@ impl<'a> Collection<'a> {
     }
 }
 
-/// Checks the options of a command line against each other, the environment and the policies, and writes nothing.
+/// Checks the options of a command line against each other, the environment and the policies, and writes nothing. Returns
+/// the columns of the dataset.
 ///
 /// # Errors
 /// As [`run_args`], before the first episode.
-pub fn check(args: &CollectArgs) -> Result<()> {
+pub fn check(args: &CollectArgs) -> Result<Schema> {
     let location = home::target(&args.output, args.format.as_deref())?;
     let mut collection = Collection::of(args, &location, 1)?;
     limits::ENVS.check(args.envs)?;
     collection.world.envs = 1;
     let (mut world, ..) = collection.prepare()?;
     // Environments check camera views when they render.
-    world.reset(args.seed.unwrap_or(0), &collection.config.variation).map(drop)
+    world.reset(args.seed.unwrap_or(0), &collection.config.variation)?;
+    world.collect_schema(&collection.config)
 }
 
 /// Collects, and shows progress.

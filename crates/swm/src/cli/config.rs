@@ -30,23 +30,36 @@ enum Codec {
     Jpeg,
 }
 
+impl Codec {
+    /// The name on the command line.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Qoi => "qoi",
+            Self::Png => "png",
+            Self::Jpeg => "jpeg",
+        }
+    }
+}
+
 impl CodecArgs {
-    /// Checks that a dataset's format has codecs, if JPEG is chosen; `format` is its id, if the command names it.
+    /// Checks that a codec that is chosen has an effect in the dataset's format; `format` is its id, if the command names it.
     ///
     /// # Errors
-    /// When the format stores frames without loss.
+    /// When the format stores frames without loss and has no codecs, or stores videos and the codec is one of single images.
     pub fn check_format(&self, location: &Location, format: Option<&str>) -> Result<()> {
         let entry = match format {
             Some(id) => Some(FORMATS.get(id)?),
             None => FORMATS.rows.iter().find(|entry| (entry.detect)(location)),
         };
-        match (entry.filter(|entry| !entry.codecs), self.codec) {
-            (Some(entry), Some(Codec::Jpeg)) => {
-                let problem = format!("the format {} stores frames without loss", entry.id);
-                Err(Error::config("--codec jpeg", problem, "leave it out, or choose another format"))
-            }
-            _ => Ok(()),
-        }
+        let (Some(entry), Some(codec)) = (entry, self.codec) else { return Ok(()) };
+        let is_lossy = matches!(codec, Codec::Jpeg);
+        let problem = match (entry.codecs, entry.exact_images) {
+            (false, _) => format!("the format {} stores frames without loss, in a way of its own", entry.id),
+            (true, false) if !is_lossy => format!("the format {} stores videos, without loss by default", entry.id),
+            (true, _) => return Ok(()),
+        };
+        let fix = if entry.codecs { "leave it out, or choose jpeg" } else { "leave it out, or choose another format" };
+        Err(Error::config(format!("--codec {}", codec.name()), problem, fix))
     }
 
     /// Returns the codec with its quality.
@@ -175,6 +188,24 @@ pub fn image_size(given: &str) -> std::result::Result<(usize, usize), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn codecs_without_effect_are_refused() {
+        let check = |codec, name: &str| {
+            let location = Location::Path(name.into());
+            CodecArgs { codec, quality: None }.check_format(&location, None).map_err(|error| error.to_string())
+        };
+        for (name, part) in [("a.video", "stores videos"), ("a.lerobot", "stores videos"), ("a.h5", "without loss")] {
+            for codec in [Codec::Png, Codec::Qoi] {
+                let error = check(Some(codec), name).expect_err(name);
+                assert!(error.contains(&format!("--codec {}", codec.name())) && error.contains(part), "{error}");
+            }
+            check(None, name).expect(name);
+        }
+        check(Some(Codec::Jpeg), "a.video").expect("the quality of a video");
+        check(Some(Codec::Jpeg), "a.h5").expect_err("a format without codecs");
+        check(Some(Codec::Png), "a.lance").expect("a format of single images");
+    }
 
     #[test]
     fn parses_variation_and_frame_sizes() {

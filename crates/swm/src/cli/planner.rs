@@ -22,7 +22,7 @@ pub struct PlannerArgs {
     /// Model steps per plan (default: 5)
     #[arg(long, value_name = "STEPS")]
     pub horizon: Option<usize>,
-    /// Model steps to execute before planning again (default: 5)
+    /// Model steps to execute before planning again (default: 5, at most the horizon)
     #[arg(long, value_name = "STEPS")]
     pub receding_horizon: Option<usize>,
     /// Environment steps per model step of the simulator
@@ -136,7 +136,7 @@ impl PlannerArgs {
         let horizon = self.horizon.unwrap_or(HORIZON);
         let mpc = MpcConfig {
             horizon,
-            receding_horizon: self.receding_horizon.unwrap_or(HORIZON).min(horizon),
+            receding_horizon: self.receding_horizon.unwrap_or(HORIZON.min(horizon)),
             action_block: block,
             warm_start: !self.cold_start,
             history,

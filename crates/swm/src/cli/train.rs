@@ -124,13 +124,31 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
     }
     let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
     let (reader, out) = args.dataset_and_output()?;
+    let setup = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
+    // A folder that holds another run is refused as such.
+    if args.resume || StoredCheckpoint::read(&out).is_err() {
+        config.check_data(&setup)?;
+    }
     record(&out, args.resume)?;
     let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt)?;
-    let setup = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
     let summary = run(&*config, setup, context);
     drop(trackers);
-    let summary = summary?;
+    let summary = summary.inspect_err(|error| withdraw(&out, args.resume, error))?;
     Ok((summary.checkpoint.clone(), json!(summary)))
+}
+
+/// Deletes the record of a new training whose settings were refused before it wrote anything else, and the empty folder.
+fn withdraw(out: &Path, resume: bool, error: &Error) {
+    let lock = (!resume && error.is_usage()).then(|| Lock::folder(out).ok()).flatten();
+    if lock.is_none() {
+        return;
+    }
+    let is_record = |entry: std::io::Result<std::fs::DirEntry>| entry.is_ok_and(|e| e.file_name() == run_record::FILE);
+    if std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(is_record)) {
+        // The error of the training is the one to report.
+        let _ = files::delete(out, &[run_record::FILE]);
+        let _ = files::remove_empty_folder(out);
+    }
 }
 
 /// Writes the record of a run before its first step, so that the run can be continued from it. A folder that holds another
@@ -173,13 +191,12 @@ fn train_online(
     record(&out, args.resume)?;
     let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt)?;
     let setup = OnlineRun { environments: &environments, out: &out, options };
-    let summary = config.train_online(setup, &mut control(context));
-    drop(trackers);
-    let Some(summary) = summary else {
+    let summary = config.train_online(setup, &mut control(context)).unwrap_or_else(|| {
         let problem = format!("{} trains on datasets only", args.model());
-        anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
-    };
-    let summary = summary?;
+        Err(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"))
+    });
+    drop(trackers);
+    let summary = summary.inspect_err(|error| withdraw(&out, args.resume, error))?;
     let evaluated = summary.evaluated.map_or(String::new(), |mean| format!(", mean return {mean:.1}"));
     let best = summary.best.map_or(String::new(), |(step, mean)| format!(", best {mean:.1} after step {step}"));
     let message = format!(

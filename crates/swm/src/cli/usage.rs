@@ -18,6 +18,24 @@ pub fn plain(error: &clap::Error) -> String {
     in_words(error, error.render().to_string())
 }
 
+/// Returns the text of an error in the arguments on one line, without the usage that follows it.
+pub fn on_one_line(error: &clap::Error) -> String {
+    let text = plain(error);
+    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+    let mut words = String::new();
+    for line in lines.take_while(|line| !line.starts_with("Usage") && !line.starts_with("For more")) {
+        words.push_str(if words.is_empty() {
+            ""
+        } else if words.ends_with(':') {
+            " "
+        } else {
+            "; "
+        });
+        words.push_str(line);
+    }
+    words.trim_start_matches("error: ").to_owned()
+}
+
 /// Replaces the reason that a library gives for a refused value.
 fn in_words(error: &clap::Error, mut text: String) -> String {
     if let Some(source) = error.source()
@@ -56,6 +74,14 @@ fn reason(source: &(dyn std::error::Error + 'static)) -> Option<String> {
 mod tests {
     use super::*;
     use std::ffi::OsString;
+
+    #[test]
+    fn missing_arguments_are_named_on_one_line() {
+        let words = ["swm", "collect", "swm/TwoRoom-v1"].map(OsString::from).into_iter().collect();
+        let error = super::super::parse(words).err().expect("no output");
+        let text = on_one_line(&error);
+        assert!(text.contains("not provided: --output") && !text.contains("error:"), "{text}");
+    }
 
     #[test]
     fn refused_values_are_explained_in_words() {

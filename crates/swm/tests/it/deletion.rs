@@ -376,7 +376,17 @@ fn unfinished_exports_leave_nothing_or_can_be_removed() {
     swm.json(&["checkpoints", "remove", "./killed", "--yes"]);
     assert_untouched(&new.join("thesis.txt"));
     assert_eq!(fs::read_dir(&new).expect("listing the folder").count(), 1);
+    // A kill before the configuration was complete.
+    for (name, left) in [("empty", None), ("begun", Some(".config.json.7.tmp"))] {
+        let new = swm.path(name).join(".checkpoint.new");
+        fs::create_dir_all(&new).expect("creating a folder");
+        left.iter().for_each(|file| fs::write(new.join(file), "{").expect("writing a file"));
+        swm.json(&["checkpoints", "remove", &format!("./{name}"), "--yes"]);
+        assert!(!swm.path(name).exists(), "{name}");
+    }
     // Another folder of that name is no checkpoint.
+    user_file(&swm.path("mine/.checkpoint.new/config.json.tmp"));
+    swm.fails(&["checkpoints", "remove", "./mine", "--yes"], 1, &["not a checkpoint"]);
     user_file(&swm.path("mine/.checkpoint.new/config.json"));
     swm.fails(&["checkpoints", "remove", "./mine", "--yes"], 1, &["not a checkpoint"]);
 }

@@ -106,6 +106,8 @@ fn options_without_effect_are_refused() {
     let with = |more: &[&'static str]| [&collect[..], more].concat();
     swm.fails(&with(&["-o", "rooms.lance", "--quality", "5"]), 2, &["only JPEG frames have one"]);
     swm.fails(&with(&["-o", "rooms.h5", "--codec", "jpeg"]), 2, &["hdf5 stores frames without loss"]);
+    swm.fails(&with(&["-o", "rooms.h5", "--codec", "png"]), 2, &["--codec png", "hdf5 stores frames without loss"]);
+    swm.fails(&with(&["-o", "./rooms.video", "--codec", "png"]), 2, &["--codec png", "stores videos"]);
     swm.json(&with(&["-o", "rooms.lance"]));
     swm.fails(&["train", "lewm", "--data", "rooms.lance", "--max-steps", "3"], 2, &["--max-steps", "plays none"]);
     swm.fails(&["convert", "rooms.lance", "./a.h5", "--least-psnr", "30"], 2, &["without loss"]);
@@ -113,6 +115,24 @@ fn options_without_effect_are_refused() {
     for option in [&["--solver", "cem"][..], &["--horizon", "3"], &["--trace"]] {
         swm.fails(&[&eval[..], option].concat(), 2, &["none of the policies plans"]);
     }
+    let plan = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "1", "--horizon", "2"];
+    let beyond = [&plan[..], &["--receding-horizon", "3"]].concat();
+    swm.fails(&beyond, 2, &["receding horizon", "3 model steps to execute, 2 planned"]);
+}
+
+#[test]
+fn refused_trainings_leave_no_folder() {
+    let swm = Swm::new();
+    let train = |model, env| ["train", model, "--env", env, "-o", "./run"];
+    swm.fails(&train("lewm", "swm/PendulumControl-v1"), 2, &["trains on datasets only"]);
+    swm.fails(&train("sac", "swm/CartPoleControl-v1"), 2, &["continuous actions"]);
+    let column = [&train("sac", "swm/PendulumControl-v1")[..], &["model.columns=[\"stat\"]"]].concat();
+    swm.fails(&column, 2, &["stat"]);
+    assert!(!swm.path("run").exists());
+    fs::create_dir(swm.path("run")).expect("a folder of the user");
+    fs::write(swm.path("run/notes.txt"), "notes").expect("a file of the user");
+    swm.fails(&column, 2, &["stat"]);
+    assert!(swm.path("run/notes.txt").is_file());
 }
 
 #[test]

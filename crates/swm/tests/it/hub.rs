@@ -2,7 +2,7 @@
 
 use crate::hub_server::{HubServer, Repository, TOKEN, hash};
 use crate::{Swm, text};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};
 use std::sync::Arc;
 
@@ -33,6 +33,12 @@ impl Setup {
         let output = self.run(&[args, &["--json"]].concat(), token);
         assert!(output.status.success(), "{args:?}: {}", text(&output.stderr));
         serde_json::from_slice(&output.stdout).expect("a document")
+    }
+
+    /// A repository of models in the cache, which has a folder for this hub.
+    fn cached(&self, name: &str) -> PathBuf {
+        let mut hubs = std::fs::read_dir(self.swm.path("hub")).expect("the cache");
+        hubs.next().expect("a hub").expect("a folder").path().join(format!("models--lab--{name}"))
     }
 
     fn fails(&self, args: &[&str], token: Option<&str>, parts: &[&str]) {
@@ -74,10 +80,12 @@ fn pulls_pin_the_commit_and_continue_broken_downloads() {
     assert_eq!(of(&format!("hf://lab/rooms@{commit}/README.md")), "hello");
     assert_eq!(of("hf://lab/rooms@v0/README.md"), "hello");
     // Without a connection, the last commit is used; a pinned one asks nobody.
-    let mut offline = setup.swm.command(&["pull", "hf://lab/rooms/README.md", "--json"]);
-    let output = offline.env("HF_ENDPOINT", "http://127.0.0.1:9").output().expect("swm starts");
+    setup.hub.state().down = true;
+    let output = setup.run(&["pull", "hf://lab/rooms/README.md", "--json"], None);
     assert!(output.status.success() && text(&output.stdout).contains(&later), "{}", text(&output.stderr));
     assert!(text(&output.stderr).contains("downloaded before"), "{}", text(&output.stderr));
+    setup.json(&["pull", &format!("hf://lab/rooms@{commit}/README.md")], None);
+    setup.hub.state().down = false;
 
     setup.fails(&["pull", "hf://lab/rooms@v9"], None, &["no revision 'v9'"]);
     setup.fails(&["pull", "hf://lab/rooms/README.mdx"], None, &["README.mdx", "README.md"]);
@@ -97,12 +105,147 @@ fn wrong_content_is_refused_and_not_kept() {
 }
 
 #[test]
+fn changed_files_of_the_cache_are_downloaded_again() {
+    let setup = Setup::new();
+    let large = content(5000);
+    let commit = setup.hub.commit("models/lab/rooms", &[("large", &large), ("small", b"hello"), ("none", b"hello")]);
+    setup.hub.state().git_ids = [("small".to_owned(), "b6fc4c620b67d95f953a5c1c1230aaab5db5a1b0".to_owned())].into();
+    let downloaded = || setup.json(&["pull", "hf://lab/rooms"], None)["downloaded"].as_u64();
+    assert_eq!(downloaded(), Some(5010));
+    let repository = setup.cached("rooms");
+    let snapshot = repository.join("snapshots").join(&commit);
+    let record = repository.join("verified").join(format!("{commit}.json"));
+    let mut changed = large.clone();
+    changed[2500] ^= 0x10;
+    let change = || {
+        for (name, bytes) in [("large", &changed[..]), ("small", b"hullo")] {
+            // A file system may give the time of its last tick.
+            let path = snapshot.join(name);
+            std::fs::write(&path, bytes).expect("writing a file");
+            let later = std::time::SystemTime::now() + std::time::Duration::from_secs(10);
+            std::fs::File::options()
+                .append(true)
+                .open(&path)
+                .and_then(|file| file.set_modified(later))
+                .expect("a time");
+        }
+    };
+    change();
+    let output = setup.run(&["pull", "hf://lab/rooms", "--json"], None);
+    let said = text(&output.stderr);
+    let pulled: serde_json::Value = serde_json::from_slice(&output.stdout).expect("a document");
+    assert_eq!(pulled["downloaded"], 5005, "{said}");
+    assert!(said.contains("and the hub says") && said.contains("downloading it again"), "{said}");
+    assert!(said.contains("large.changed is the file that the download replaces"), "{said}");
+    assert_eq!(std::fs::read(snapshot.join("large.changed")).expect("the user's file"), changed);
+    assert_eq!(std::fs::read(snapshot.join("large")).expect("the file"), large);
+    assert_eq!(std::fs::read(snapshot.join("small")).expect("the file"), b"hello");
+    assert_eq!(downloaded(), Some(0));
+    // A cache of an earlier build has no record, and is compared once.
+    change();
+    std::fs::remove_file(&record).expect("the record");
+    assert_eq!(downloaded(), Some(5005));
+    std::fs::remove_file(&record).expect("the record");
+    assert_eq!(downloaded(), Some(0));
+    assert!(record.exists());
+    // Opening compares as well.
+    change();
+    setup.run(&["inspect", "hf://models/lab/rooms/large"], None);
+    setup.run(&["doctor", "hf://models/lab/rooms/small"], None);
+    assert_eq!(std::fs::read(snapshot.join("large")).expect("the file"), large);
+    assert_eq!(std::fs::read(snapshot.join("small")).expect("the file"), b"hello");
+    // Without a connection, the file of the user stays where it is.
+    change();
+    setup.hub.state().down = true;
+    let name = snapshot.join("large");
+    let parts = [name.to_str().expect("a name"), "it differs from the hub's file", "large.changed"];
+    setup.fails(&["pull", "hf://lab/rooms"], None, &parts);
+    assert_eq!(std::fs::read(&name).expect("the user's file"), changed);
+    // A cache whose record cannot be written is compared by sizes.
+    std::fs::remove_dir_all(repository.join("verified")).expect("removing the record");
+    std::fs::write(repository.join("verified"), "not a folder").expect("a file");
+    let output = setup.run(&["pull", "hf://lab/rooms", "--json"], None);
+    assert!(output.status.success() && text(&output.stderr).contains("compared by their size only"));
+}
+
+#[test]
+fn a_cache_that_another_process_downloads_into_is_read_if_it_has_the_files() {
+    let setup = Setup::new();
+    setup.hub.commit("models/lab/rooms", &[("a.bin", &content(5000)), ("b.bin", &content(6000))]);
+    setup.json(&["pull", "hf://lab/rooms/a.bin"], None);
+    let lock = swm_core::files::Lock::folder(&setup.cached("rooms")).expect("the lock");
+    assert_eq!(setup.json(&["pull", "hf://lab/rooms/a.bin"], None)["downloaded"], 0);
+    setup.fails(&["pull", "hf://lab/rooms/b.bin"], None, &["another process writes to it"]);
+    drop(lock);
+    assert_eq!(setup.json(&["pull", "hf://lab/rooms/b.bin"], None)["downloaded"], 6000);
+}
+
+#[test]
+fn the_cache_of_an_earlier_build_is_read_if_this_hub_lists_its_files() {
+    let setup = Setup::new();
+    let large = content(5000);
+    let commit = setup.hub.commit("models/lab/rooms", &[("large", &large)]);
+    let pull = ["pull", "hf://lab/rooms"];
+    setup.json(&pull, None);
+    let (own, old) = (setup.cached("rooms"), setup.swm.path("hub/models--lab--rooms"));
+    std::fs::rename(&own, &old).expect("a cache as earlier builds made it");
+    // It may have the files of another hub.
+    setup.hub.state().down = true;
+    let output = setup.run(&pull, None);
+    assert!(!output.status.success() && !text(&output.stderr).contains("downloaded before"));
+    setup.hub.state().down = false;
+    let output = setup.run(&["pull", "hf://lab/rooms", "--json"], None);
+    let pulled: serde_json::Value = serde_json::from_slice(&output.stdout).expect("a document");
+    assert_eq!(pulled["downloaded"], 0);
+    assert!(Path::new(pulled["path"].as_str().expect("a path")).starts_with(&old), "{pulled}");
+    let said = text(&output.stderr);
+    assert!(said.contains(old.to_str().expect("a name")) && said.contains("using them"), "{said}");
+    setup.hub.state().down = true;
+    assert!(text(&setup.run(&pull, None).stderr).contains("downloaded before"));
+    setup.hub.state().down = false;
+    // Other files are neither used nor replaced.
+    let path = old.join("snapshots").join(commit).join("large");
+    std::fs::write(&path, content(5001)).expect("a file");
+    let pulled = setup.json(&pull, None);
+    assert_eq!(pulled["downloaded"], 5000);
+    assert!(Path::new(pulled["path"].as_str().expect("a path")).starts_with(&own), "{pulled}");
+    assert_eq!(std::fs::read(path).expect("the file"), content(5001));
+}
+
+#[test]
+fn commands_that_read_the_cache_without_a_connection_say_so() {
+    let setup = Setup::new();
+    setup.hub.commit("datasets/lab/rooms", &[("README.md", b"hello")]);
+    setup.json(&["pull", "hf://datasets/lab/rooms"], None);
+    setup.hub.state().down = true;
+    for command in ["inspect", "doctor"] {
+        let said = text(&setup.run(&[command, "hf://datasets/lab/rooms/README.md"], None).stderr);
+        assert!(said.contains("downloaded before"), "{command}: {said}");
+    }
+    // The files of one hub are not those of another.
+    let mut other = setup.swm.command(&["pull", "hf://datasets/lab/rooms"]);
+    let output = other.env("HF_ENDPOINT", "http://127.0.0.1:9").output().expect("swm starts");
+    assert!(!output.status.success() && !text(&output.stderr).contains("downloaded before"));
+}
+
+#[test]
+fn an_emptied_list_of_files_is_asked_for_again() {
+    let setup = Setup::new();
+    let commit = setup.hub.commit("models/lab/rooms", &[("a", b"a")]);
+    setup.json(&["pull", "hf://lab/rooms"], None);
+    std::fs::write(setup.cached("rooms").join("lists").join(format!("{commit}.json")), "[]").expect("a list");
+    assert_eq!(setup.json(&["pull", "hf://lab/rooms"], None)["files"], 1);
+    setup.hub.commit("models/lab/none", &[]);
+    setup.fails(&["pull", "hf://lab/none"], None, &["has no files"]);
+}
+
+#[test]
 fn files_of_other_sizes_than_listed_end_the_download() {
     let setup = Setup::new();
     setup.hub.commit("models/lab/rooms", &[("short", b"0123456789"), ("long", b"0123456789"), ("empty", b"0")]);
     setup.hub.state().listed = [("short".to_owned(), 20), ("long".to_owned(), 5), ("empty".to_owned(), 0)].into();
     let kept = || -> u64 {
-        let files = std::fs::read_dir(setup.swm.path("hub/models--lab--rooms/partial")).expect("a folder");
+        let files = std::fs::read_dir(setup.cached("rooms").join("partial")).expect("a folder");
         files.map(|file| file.expect("a file").metadata().expect("its size").len()).sum()
     };
     setup.fails(&["pull", "hf://lab/rooms/short"], None, &["sent 10 of 20 bytes"]);
@@ -148,7 +291,8 @@ fn settings_of_git_are_not_downloaded() {
     for (name, inner) in [("a", ".git/config"), ("b", "data/.GIT/hooks/post-checkout")] {
         setup.hub.commit(&format!("models/lab/{name}"), &[("weights", b"w"), (inner, b"[core] fsmonitor = touch x")]);
         setup.fails(&["pull", &format!("hf://lab/{name}")], None, &["no repository has", inner]);
-        assert!(!setup.swm.path(&format!("hub/models--lab--{name}/snapshots")).exists());
+        let repository = setup.cached(name);
+        assert!(repository.exists() && !repository.join("snapshots").exists());
     }
     // A folder without that name is a repository of Git as well.
     setup.hub.commit(
@@ -156,7 +300,7 @@ fn settings_of_git_are_not_downloaded() {
         &[("HEAD", b"ref: x"), ("config", b"[core]"), ("objects/x", b"x"), ("refs/x", b"x")],
     );
     setup.fails(&["pull", "hf://lab/bare"], None, &["a repository of Git", "HEAD"]);
-    assert!(!setup.swm.path("hub/models--lab--bare/snapshots").exists());
+    assert!(setup.cached("bare").exists() && !setup.cached("bare").join("snapshots").exists());
     setup.hub.commit("models/lab/c", &[(".gitattributes", b"*.bin filter=lfs")]);
     setup.json(&["pull", "hf://lab/c"], None);
 }

@@ -34,6 +34,10 @@ pub(crate) struct State {
     pub listed: BTreeMap<String, u64>,
     /// What the hub lists in place of the hash of large files.
     pub wrong_oid: Option<String>,
+    /// What the hub lists as the ids of small files in Git.
+    pub git_ids: BTreeMap<String, String>,
+    /// Whether the hub breaks every connection.
+    pub down: bool,
     /// Whether the storage sends readers to another address of its own.
     pub moves: bool,
     /// The commit that the hub answers to an upload, in place of the one that it made.
@@ -124,6 +128,9 @@ impl HubServer {
         let mut reader = BufReader::new(stream.try_clone().expect("the connection"));
         let mut out = stream;
         while let Some(request) = read(&mut reader) {
+            if self.state().down {
+                return;
+            }
             let answer = if is_storage { self.store(&request) } else { self.answer(&request) };
             let length = answer.body.len();
             if answer.endless {
@@ -391,7 +398,8 @@ fn route(path: &str) -> Option<(&str, String, String)> {
 
 fn entry(path: &str, bytes: &[u8], state: &State) -> Value {
     let size = state.listed.get(path).copied().unwrap_or(bytes.len() as u64);
-    let mut entry = json!({"type": "file", "path": path, "size": size, "oid": "0"});
+    let git_id = state.git_ids.get(path).map_or("0", String::as_str);
+    let mut entry = json!({"type": "file", "path": path, "size": size, "oid": git_id});
     if bytes.len() >= LARGE {
         let oid = state.wrong_oid.clone().unwrap_or_else(|| hash(bytes));
         entry["lfs"] = json!({"oid": oid, "size": bytes.len(), "pointerSize": 130});

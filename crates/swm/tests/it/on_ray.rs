@@ -78,7 +78,7 @@ fn files_of_the_user_in_the_output_are_refused() {
     let swm = Swm::new();
     swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--episodes", "2", "--image", "32", "--max-steps", "20"]);
     let study = "title = \"T\"\nquestion = \"q?\"\n[defaults]\nenv = \"swm/TwoRoom-v1\"\nepisodes = 1\n\
-                 [[condition]]\nname = \"c\"\n[[policy]]\nname = \"p\"\npolicy = \"random\"\n";
+                 [[condition]]\nname = \"c\"\n[[policy]]\nname = \"random\"\npolicy = \"random\"\n";
     std::fs::write(swm.path("study.toml"), study).expect("a study");
     let python = fake_python(&swm);
     let fails = |args: &[&str], part: &str| {

@@ -115,6 +115,12 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
     assert_eq!(swm.json(&["inspect", "rooms"])["manifest"]["config"]["wrappers"][1]["id"], "grayscale");
     swm.json(&["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=6", "data.batch_size=32"]);
     let inverse = ["train", "inverse", "--data", "rooms", "-o", "direct", "--encoder", "small", "schedule.steps=4"];
+    // What does not fill a batch is refused before there is a folder of the run.
+    let large = ["train", "lewm", "--data", "rooms", "-o", "./large", "data.batch_size=100000"];
+    swm.fails(&large, 2, &["do not fill one batch of 100000"]);
+    let large = ["train", "inverse", "--data", "rooms", "-o", "./large", "--encoder", "small", "batch_size=100000"];
+    swm.fails(&large, 2, &["do not fill one batch"]);
+    assert!(!swm.path("large").exists());
     let trained = swm.json(&[&inverse[..], &["batch_size=16", "hidden=32"]].concat());
     assert_eq!(trained["steps"], 4);
     swm.fails(&inverse, 2, &["holds a training run already"]);

@@ -151,6 +151,23 @@ fn recipes_are_listed_and_checked_before_they_run() {
     swm.fails(&["train", "--recipe", "/dev/zero", "-o", "bad"], 2, &["ends with .toml"]);
 }
 
+#[test]
+fn columns_of_a_model_are_compared_with_the_collection_before_a_recipe_runs() {
+    let swm = Swm::new();
+    for (from, to, parts) in [
+        (
+            "model.image = 32",
+            "model.image = 16",
+            &["[[train]] 'small' of the recipe", "[32, 32, 3]", "[16, 16, 3]"][..],
+        ),
+        ("\nimage = 32", "\nno-pixels = true", &["[[train]] 'small' of the recipe", "unknown column 'pixels'"]),
+    ] {
+        write(&swm, "bad.toml", &RECIPE.replacen(from, to, 1));
+        swm.fails(&["train", "--recipe", "bad.toml", "-o", "bad"], 2, parts);
+        assert!(!swm.path("bad").exists(), "{to}");
+    }
+}
+
 /// A recipe of one collection and one training with `train` in its table.
 fn training(train: &str) -> String {
     let (collect, _) = RECIPE.split_once("[[train]]").expect("a training");

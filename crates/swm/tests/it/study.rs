@@ -32,7 +32,7 @@ name = "planner"
 policy = "expert"
 
 [[policy]]
-name = "chance"
+name = "random"
 policy = "random"
 
 [[published]]
@@ -306,7 +306,7 @@ fn errors_in_a_study_name_the_line_and_the_nearest_word() {
     let swm = Swm::new();
     for (from, to, parts) in [
         ("budget = 40", "bugdet = 40", vec!["study.toml:8", "bugdet", "budget"]),
-        ("[[policy]]\nname = \"chance\"", "[[polisy]]\nname = \"chance\"", vec!["study.toml", "polisy", "policy"]),
+        ("[[policy]]\nname = \"random\"", "[[polisy]]\nname = \"random\"", vec!["study.toml", "polisy", "policy"]),
         ("\"expert\"", "\"exprt\"", vec!["planner", "exprt"]),
         ("hsv({hue},1,1)", "hsv({hue},1)", vec!["study.toml:15", "hsv(0,1)", "HUE"]),
         ("budget = 40", "budget = \"many\"", vec!["study.toml:12", "--budget", "many"]),
@@ -314,13 +314,22 @@ fn errors_in_a_study_name_the_line_and_the_nearest_word() {
         ("budget = 40", "budget = ", vec!["study.toml:8"]),
         ("hue = [0, 240]", "hue = [0, 0]", vec!["same evaluation"]),
         ("[defaults]", "families = [\"polisy\"]\n[defaults]", vec!["study.toml:5", "polisy", "policy"]),
-        ("\"random\"", "\"random\"\neach = { training-seed = [1] }", vec!["'chance' does not contain {training-seed}"]),
+        (
+            "policy = \"random\"",
+            "policy = \"random\"\neach = { training-seed = [1] }",
+            vec!["'random' does not contain {training-seed}"],
+        ),
+        (
+            "name = \"random\"",
+            "name = \"chance\"",
+            vec!["of 'chance'", "the random policy has the name 'chance'", "write name = \"random\""],
+        ),
         ("planner = 0.9", "planner = 90", vec!["study.toml:30", "not a success rate", "0 to 1"]),
         ("source = \"a table\"", "sources = \"a table\"", vec!["study.toml:29", "sources", "source"]),
         ("source = \"a table\"", "", vec!["study.toml:28", "no source"]),
-        ("name = \"chance\"", "name = \"chance\\nswm: done\"", vec!["study.toml:", "several lines"]),
+        ("name = \"random\"", "name = \"random\\nswm: done\"", vec!["study.toml:", "several lines"]),
         (
-            "name = \"chance\"\npolicy = \"random\"",
+            "name = \"random\"\npolicy = \"random\"",
             "name = \"planner\"\npolicy = \"no-op\"",
             vec!["of planner", "two cells have this name", "different names"],
         ),

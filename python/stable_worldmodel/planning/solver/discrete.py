@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from .engine import EngineSolver
+from .engine import EngineSolver, single
 from .hooks import view
 
 __all__ = ["DiscreteSolver"]
@@ -25,8 +25,8 @@ class DiscreteSolver(EngineSolver):
     """
 
     def configure(self, *, action_space: spaces.Space[Any], n_envs: int, config: Any) -> None:
-        """See `Solver.configure`; the space is `Discrete` or `MultiDiscrete`."""
-        if not isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+        """See `Solver.configure`; the space is `Discrete` or `MultiDiscrete`, or one of several environments."""
+        if not isinstance(single(action_space, n_envs), (spaces.Discrete, spaces.MultiDiscrete)):
             raise SpaceError(f"{type(self).__name__} plans discrete actions, got the action space {action_space}")
         super().configure(action_space=action_space, n_envs=n_envs, config=config)
 

@@ -29,6 +29,9 @@ PLANS: ContextVar[list[tuple[int, int]] | None] = ContextVar("PLANS", default=No
 #: The scaler between the units of the next call's plans and those of the environment: see `MPCPolicy`.
 ACTION_SCALER: ContextVar[Any] = ContextVar("ACTION_SCALER", default=None)
 
+#: The most options of a choice.
+_MOST_OPTIONS = 1 << 20
+
 #: Held while a call of `solve` takes its number; not by the solvers, because locks cannot be pickled.
 _COUNTING = fork_lock()
 
@@ -305,12 +308,17 @@ def summed_costs(trace: list[dict[str, Any]], samples: int) -> list[list[float]]
 def single(space: Any, envs: int) -> Any:
     """The action space of one environment, given that space or the batched space of `envs` environments.
 
-    A `MultiDiscrete` of `envs` equal sizes is taken as the batched space of a `Discrete`, as Gymnasium defines it.
+    A `MultiDiscrete` of `envs` equal sizes is taken as the batched space of a `Discrete`, and a `Box` of whole numbers as that
+    of a `MultiDiscrete`, as Gymnasium defines them.
     """
     if isinstance(space, spaces.Box) and len(space.shape) > 1:
+        low, high = space.low[0], space.high[0]
+        if space.dtype.kind in "iu" and (np.subtract(high, low, dtype=np.float64) < _MOST_OPTIONS).all():
+            start = low.astype(np.int64)
+            return spaces.MultiDiscrete(high - start + 1, dtype=space.dtype.type, start=start)
         return spaces.Box(space.low[0], space.high[0], dtype=space.dtype.type)
     if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim > 1:
-        return spaces.MultiDiscrete(space.nvec[0])
+        return spaces.MultiDiscrete(space.nvec[0], start=space.start[0])
     if isinstance(space, spaces.MultiDiscrete) and len(space.nvec) == envs and (space.nvec == space.nvec[0]).all():
         return spaces.Discrete(space.nvec[0], start=space.start[0])
     return space

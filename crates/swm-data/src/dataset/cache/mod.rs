@@ -241,6 +241,10 @@ impl Reader for CachedReader {
         self.inner.irregularities()
     }
 
+    fn check_files(&self) -> Result<()> {
+        self.inner.check_files()
+    }
+
     fn sources(&self) -> Vec<PathBuf> {
         self.inner.sources()
     }

@@ -20,6 +20,7 @@ use crate::dataset::goals::{GoalSpec, Goals};
 use crate::dataset::reader::Reader;
 use crate::dataset::sync::lock;
 use rand::Rng as _;
+use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::{Arc, Mutex};
 use swm_core::{Error, Key, Result, Schema, limits};
@@ -44,7 +45,7 @@ pub struct LoaderConfig {
     pub prefetch: usize,
     /// Maximum number of bytes of prefetched batches; at least one batch is prefetched.
     pub prefetch_bytes: usize,
-    /// Positions of the episodes to use; all for `None`.
+    /// Positions of the episodes to use, each once; all for `None`.
     pub episodes: Option<Vec<usize>>,
     /// Whether an incomplete last batch is dropped.
     pub drop_last: bool,
@@ -119,13 +120,14 @@ impl Loader {
     /// Creates a loader. Dropping the loader stops its threads.
     ///
     /// # Errors
-    /// If a column or an episode does not exist, no episode is long enough for a clip, a size in `config` is 0, the rank is
-    /// out of range, a batch is too large, a goal's probabilities are invalid, or the cache's folder cannot be used.
+    /// If a column or an episode does not exist, an episode is chosen twice, no episode is long enough for a clip, a
+    /// size in `config` is 0, the rank is out of range, a batch is too large, a goal's probabilities are invalid, or
+    /// the cache's folder cannot be used.
     pub fn new(reader: Arc<dyn Reader>, config: LoaderConfig) -> Result<Self> {
         config.slice.check()?;
         let filler = BatchFiller::new(reader.schema(), config.clip, config.goals)?;
         let positions = match config.episodes {
-            Some(positions) => positions,
+            Some(positions) => check_once(positions)?,
             None => (0..reader.episodes().len()).collect(),
         };
         let clips = Clips::reaching(filler.clip(), filler.reach(), reader.episodes(), &positions)?;
@@ -195,6 +197,22 @@ impl Loader {
         });
         let producer = EpochSource { source: Arc::clone(&self.source), order, epoch };
         Workers::start(&self.workers, Arc::new(producer), first_batch..self.batches, self.prefetch)
+    }
+}
+
+/// Returns positions of episodes, each of which may be there once: otherwise an epoch has its clips twice.
+///
+/// # Errors
+/// If a position is there twice.
+fn check_once(positions: Vec<usize>) -> Result<Vec<usize>> {
+    let mut seen = HashSet::new();
+    match positions.iter().find(|position| !seen.insert(**position)) {
+        Some(twice) => Err(Error::config(
+            "episodes",
+            format!("{twice} is there twice"),
+            "name every episode once; a concatenation of datasets repeats them",
+        )),
+        None => Ok(positions),
     }
 }
 

@@ -140,6 +140,10 @@ impl Reader for Concat {
         Ok(found)
     }
 
+    fn check_files(&self) -> Result<()> {
+        self.parts.iter().try_for_each(|part| part.check_files())
+    }
+
     fn sources(&self) -> Vec<PathBuf> {
         self.parts.iter().flat_map(|part| part.sources()).collect()
     }

@@ -76,6 +76,11 @@ impl Reader for Merge {
         self.base.irregularities()
     }
 
+    fn check_files(&self) -> Result<()> {
+        self.base.check_files()?;
+        self.other.check_files()
+    }
+
     fn sources(&self) -> Vec<PathBuf> {
         [self.base.sources(), self.other.sources()].concat()
     }

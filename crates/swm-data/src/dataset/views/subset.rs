@@ -107,6 +107,10 @@ impl Reader for Subset {
         Ok(found.collect())
     }
 
+    fn check_files(&self) -> Result<()> {
+        self.reader.check_files()
+    }
+
     fn sources(&self) -> Vec<PathBuf> {
         self.reader.sources()
     }

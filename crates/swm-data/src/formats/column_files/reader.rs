@@ -5,7 +5,7 @@ use super::journal::PendingEpisode;
 use super::npz::Npz;
 use super::{LENGTHS, METADATA, Metadata, OFFSETS, column_path, constant_member, journal};
 use crate::dataset::episodes::{EpisodeRows, index_columns};
-use crate::dataset::{Constants, StepRange};
+use crate::dataset::{Constants, Irregularity, StepRange};
 use crate::formats::opened::Opened;
 use crate::formats::set_aside::COLUMN_FILES;
 use std::collections::BTreeMap;
@@ -85,6 +85,29 @@ impl ColumnFiles {
     /// If it was replaced.
     pub fn check(&self) -> Result<()> {
         self.opened.check(|| self.is_same())
+    }
+
+    /// Finds the column files with more rows than the episodes in `ep_len.npz`. While the journal has episodes, more rows are what
+    /// a merge leaves that is not finished.
+    ///
+    /// # Errors
+    /// If a column file cannot be read.
+    pub fn excess_rows(&self) -> Result<Vec<Irregularity>> {
+        let episodes = self.rows.episodes();
+        if self.episodes_in_files() < episodes.len() || episodes.is_empty() {
+            return Ok(vec![]);
+        }
+        let expected: usize = episodes.iter().map(|episode| episode.length).sum();
+        let mut found = vec![];
+        for ColumnSpec { name, .. } in self.columns() {
+            let rows = Npz::open(&column_path(&self.folder, name))?.header()?.rows();
+            if rows > expected {
+                let what = format!("'{name}' has {rows} rows, and the episodes have {expected}");
+                found.push(Irregularity { episode: None, what });
+            }
+        }
+        self.check()?;
+        Ok(found)
     }
 
     /// Whether the dataset in the folder is this one, or has grown from it. A program that replaces files by itself counts no

@@ -2,7 +2,7 @@
 
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash};
-use crate::dataset::{Constants, Episode, Reader, StepRange};
+use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::formats::column_files::{ColumnFiles, SUFFIXES, check_unchanged, exists, image_path, state_of};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -83,6 +83,10 @@ impl Reader for FolderReader {
 
     fn constants(&self, episode: usize) -> Result<Constants> {
         self.files.constants(episode)
+    }
+
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        self.files.excess_rows()
     }
 
     fn sources(&self) -> Vec<PathBuf> {

@@ -21,7 +21,12 @@ const ROWS_PER_READ: usize = 64;
 
 /// Opens a file.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
-    Ok(Arc::new(Hdf5Reader::open(&super::file(location)?)?))
+    let location = super::file(location)?;
+    if let Some(path) = location.path().filter(|path| super::is_unfinished(path)) {
+        let problem = "is being created: its writer has not finished its first bytes, or was killed before it did";
+        return Err(Error::corrupt(path, problem, "open it again in a moment; if no writer runs, collect it again"));
+    }
+    Ok(Arc::new(Hdf5Reader::open(&location)?))
 }
 
 pub(super) struct Hdf5Reader {

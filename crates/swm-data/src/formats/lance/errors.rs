@@ -1,5 +1,6 @@
 //! Errors of Lance and of object stores, in the words of this crate.
 
+use crate::dataset::objects::without_passwords;
 use std::path::Path;
 use swm_core::Error;
 
@@ -15,7 +16,7 @@ pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
 /// Converts Lance's errors: errors of the operating system become [`Error::Io`], errors of a remote store keep their
 /// message, and all other errors mean that files are damaged.
 pub fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
-    let text = error.to_string();
+    let text = without_passwords(&error.to_string());
     // Lance takes damage for a fault of its own, and asks for a report.
     let text = without_position(text.split_once("/lance/issues. ").map_or(text.as_str(), |(_, found)| found));
     let text = without_kind(text);

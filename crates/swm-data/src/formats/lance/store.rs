@@ -133,6 +133,7 @@ impl Store {
         // Lance supports.
         let scheme = Url::parse("memory:///").map_err(|e| Error::external("opening an object store", e))?;
         let ordered = lists && objects::lists_in_order(url);
+        let store = Arc::new(objects::Unchanged::new(store, base.clone().join("data"), hash_in_name));
         let objects = ObjectStore::new(store, scheme, Some(BLOCK), None, false, ordered, REQUESTS, RETRIES, None);
         Ok(Self { label: location.label(), remote: true, lists, base, objects: Arc::new(objects) })
     }
@@ -407,6 +408,19 @@ impl Store {
     /// The object store, for reading byte ranges.
     pub fn inner(&self) -> &dyn object_store::ObjectStore {
         &*self.objects.inner
+    }
+
+    /// The BLAKE3 hash of an object, in hexadecimal.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn hash_object(&self, path: &StorePath) -> Result<String> {
+        let (store, path) = (Arc::clone(&self.objects), path.clone());
+        block_on(
+            &self.label,
+            "hashing a data file",
+            async move { Ok(objects::hash_object(&*store.inner, &path).await?.0) },
+        )
     }
 
     /// Opens a data file for reading. Must run inside [`block_on`].

@@ -107,6 +107,10 @@ impl Reader for LanceVideoReader {
         Ok(all)
     }
 
+    fn check_files(&self) -> Result<()> {
+        self.steps.check_files()
+    }
+
     fn sources(&self) -> Vec<PathBuf> {
         vec![self.label.clone()]
     }

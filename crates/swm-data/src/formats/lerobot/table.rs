@@ -3,6 +3,7 @@
 use super::info::damaged;
 use crate::formats::guarded::guarded;
 use arrow_array::cast::AsArray as _;
+use arrow_array::types::{Int32Type, Int64Type};
 use arrow_array::{Array, RecordBatch};
 use arrow_schema::Schema as ArrowSchema;
 use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder, RowSelection};
@@ -154,18 +155,20 @@ fn is_outside(column: &ColumnChunkMetaData) -> bool {
         || column.dictionary_page_offset().is_some_and(is_negative)
 }
 
-/// The values of an integer column.
+/// The values of an integer column of 64 or 32 bits.
 ///
 /// # Errors
 /// If there is no such column, or the column has another type.
 pub fn integers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
     let mut integers = vec![];
     for batch in batches {
-        let values = batch.column_by_name(column).and_then(|array| {
-            array.as_primitive_opt::<arrow_array::types::Int64Type>().filter(|array| array.null_count() == 0)
-        });
-        let values = values.ok_or_else(|| damaged(path, format!("it has no integer column '{column}'")))?;
-        integers.extend_from_slice(values.values());
+        let array = batch.column_by_name(column).filter(|array| array.null_count() == 0);
+        let long = array.and_then(|array| array.as_primitive_opt::<Int64Type>());
+        match (long, array.and_then(|array| array.as_primitive_opt::<Int32Type>())) {
+            (Some(values), _) => integers.extend_from_slice(values.values()),
+            (_, Some(values)) => integers.extend(values.values().iter().map(|&value| i64::from(value))),
+            _ => return Err(damaged(path, format!("it has no integer column '{column}'"))),
+        }
     }
     Ok(integers)
 }
@@ -205,7 +208,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use arrow_array::StringArray;
+    use arrow_array::{Int32Array, Int64Array, StringArray};
     use arrow_schema::{DataType, Field};
 
     #[test]
@@ -223,6 +226,23 @@ mod tests {
         assert!(error.contains("its rows take more than 1048576 bytes"), "{error}");
         let rows = read_within(&path, &["tasks"], 1 << 26).expect("64 MB suffice");
         assert_eq!(rows.iter().map(RecordBatch::num_rows).sum::<usize>(), 1000);
+    }
+
+    #[test]
+    fn integers_have_64_or_32_bits() {
+        let read = |array: arrow_array::ArrayRef| {
+            let batch = RecordBatch::try_from_iter([("episode_index", array)]).expect("a table");
+            integers(Path::new("data.parquet"), &[batch], "episode_index").map_err(|error| error.to_string())
+        };
+        assert_eq!(read(Arc::new(Int32Array::from(vec![0, -1, 7]))), Ok(vec![0, -1, 7]));
+        assert_eq!(read(Arc::new(Int64Array::from(vec![1 << 40]))), Ok(vec![1 << 40]));
+        for array in [
+            Arc::new(Int32Array::from(vec![Some(0), None])) as arrow_array::ArrayRef,
+            Arc::new(StringArray::from(vec!["0"])),
+        ] {
+            let error = read(array).expect_err("no integers");
+            assert!(error.contains("no integer column 'episode_index'"), "{error}");
+        }
     }
 
     #[test]

@@ -85,7 +85,7 @@ impl Reader for VideoReader {
                 Some(Irregularity { episode: Some(position), what })
             })
         });
-        Ok(found.collect())
+        Ok(self.files.excess_rows()?.into_iter().chain(found).collect())
     }
 
     fn sources(&self) -> Vec<PathBuf> {

@@ -99,8 +99,9 @@ pub struct Converted {
 /// have the same checksum if, and only if, readers return the same bytes.
 ///
 /// # Errors
-/// If the data is damaged.
+/// If the data is damaged, or the files were changed ([`Reader::check_files`]).
 pub fn checksum(reader: &dyn Reader) -> Result<String> {
+    reader.check_files()?;
     let source = Source::new(reader);
     let mut batch = Batch::zeros(&source.schema, 0);
     let mut hashes = vec![];

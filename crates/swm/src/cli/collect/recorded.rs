@@ -2,8 +2,8 @@
 
 use super::CollectArgs;
 use crate::cli::config::VariationArgs;
-use crate::cli::output;
 use crate::cli::wrappers::{WrapperArgs, shown};
+use crate::cli::{output, usage};
 use crate::home;
 use crate::resolver::check_wrapper;
 use clap::Parser;
@@ -78,8 +78,7 @@ fn parse(location: &Location, command: &[String]) -> Result<CollectArgs> {
     }
     let words = ["collect", "--output="].into_iter().chain(command.iter().map(String::as_str));
     Command::try_parse_from(words).map(|command| command.arguments).map_err(|error| {
-        let text = error.to_string();
-        let problem = text.lines().next().unwrap_or_default().trim_start_matches("error: ");
+        let problem = usage::on_one_line(&error);
         Error::config(location.to_string(), format!("what it records is no collection: {problem}"), NAME_ALL)
     })
 }

@@ -333,10 +333,7 @@ pub fn parse<T: Args>(kind: Kind, step: &Step, arguments: &[String]) -> Result<T
     }
     let words = std::iter::once(kind.name()).chain(arguments.iter().map(String::as_str));
     Command::<T>::try_parse_from(words).map(|command| command.arguments).map_err(|error| {
-        let text = usage::plain(&error);
-        let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
-        let problem =
-            lines.iter().take_while(|line| !line.starts_with("Usage")).copied().collect::<Vec<_>>().join("; ");
+        let problem = usage::on_one_line(&error);
         let what = format!("[[{}]] '{}' of the recipe{}", kind.name(), step.name, step.lines.of_problem(&problem));
         Error::config(what, problem, format!("`swm {} --help` lists the options", kind.name()))
     })

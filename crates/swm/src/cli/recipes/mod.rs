@@ -23,6 +23,7 @@ const SHIPPED: &[(&str, &str)] = &[
     ("ogb-cube/gcbc", include_str!("../../../recipes/ogb-cube/gcbc.toml")),
     ("ogb-cube/lewm", include_str!("../../../recipes/ogb-cube/lewm.toml")),
     ("push-t/gcbc", include_str!("../../../recipes/push-t/gcbc.toml")),
+    ("push-t/gcivl", include_str!("../../../recipes/push-t/gcivl.toml")),
     ("push-t/lewm", include_str!("../../../recipes/push-t/lewm.toml")),
     ("push-t/pldm", include_str!("../../../recipes/push-t/pldm.toml")),
     ("reacher/lewm", include_str!("../../../recipes/reacher/lewm.toml")),
@@ -105,7 +106,8 @@ mod tests {
         assert_eq!(found, shipped);
         for (name, text) in SHIPPED {
             let recipe = Recipe::parse(name, text).expect(name);
-            run::check(&recipe, Path::new("folder")).expect(name);
+            let columns = run::check(&recipe, Path::new("folder")).expect(name);
+            run::check_columns(&recipe, Path::new("folder"), &columns).expect(name);
         }
     }
 }

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Origin, Result, files};
+use swm_core::{Error, Origin, Result, Schema, files};
 use swm_models::{StoredCheckpoint, checkpoint};
 use swm_report::ReportOptions;
 
@@ -68,8 +68,9 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     let mut recipe = Recipe::parse(request.recipe, &text)?;
     request.settings.iter().try_for_each(|setting| recipe.set(setting))?;
     recipe.check_origin(&origin)?;
-    check(&recipe, request.output)?;
+    let columns = check(&recipe, request.output)?;
     check_weights(&recipe, request, &origin)?;
+    check_columns(&recipe, request.output, &columns)?;
     let _lock = output_folder::claim(request.output, &["index.html"])?;
     files::delete_temporary(request.output, |name| name == STATE)?;
     // The folder may come from a stranger, whose links name folders of the user.
@@ -118,17 +119,23 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Checks the options of every step before anything runs, as far as they do not depend on outputs of earlier steps.
+/// The columns of the datasets that a recipe collects, by the paths of the datasets.
+pub(super) type Columns = BTreeMap<PathBuf, Schema>;
+
+/// Checks the options of every step before anything runs, as far as they do not depend on outputs of earlier steps. Returns
+/// the columns of the datasets to collect.
 ///
 /// # Errors
 /// When an option is unknown or invalid, or contradicts another.
-pub fn check(recipe: &Recipe, folder: &Path) -> Result<()> {
+pub(super) fn check(recipe: &Recipe, folder: &Path) -> Result<Columns> {
+    let mut columns = Columns::new();
     let outputs: Vec<PathBuf> = recipe.steps().map(|(kind, step)| kind.output(folder, &step.name)).collect();
     let resolver = HomeResolver::new(Origin::User);
     for (kind, step) in recipe.steps() {
         let arguments = recipe.arguments(kind, step, folder);
         let checked = match kind {
-            Kind::Collect => collect::check(&parse::<CollectArgs>(kind, step, &arguments)?),
+            Kind::Collect => collect::check(&parse::<CollectArgs>(kind, step, &arguments)?)
+                .map(|schema| drop(columns.insert(kind.output(folder, &step.name), schema))),
             Kind::Train => parse::<TrainArgs>(kind, step, &arguments)?.config().map(drop),
             Kind::Eval => {
                 let is_output = |policy: &str| outputs.iter().any(|output| output == Path::new(policy));
@@ -138,13 +145,30 @@ pub fn check(recipe: &Recipe, folder: &Path) -> Result<()> {
         checked.map_err(|error| match error {
             // Its hint lists names.
             Error::UnknownName { .. } => error,
-            error => {
-                let problem = error.to_string();
-                let line = step.lines.of_problem(&problem);
-                let what = format!("[[{}]] '{}' of the recipe{line}", kind.name(), step.name);
-                Error::config(what, problem, "correct its options")
-            }
+            error => of_step(kind, step, &error),
         })?;
+    }
+    Ok(columns)
+}
+
+/// Names the step in an error of its options.
+fn of_step(kind: Kind, step: &Step, error: &Error) -> Error {
+    let problem = error.to_string();
+    let line = step.lines.of_problem(&problem);
+    let what = format!("[[{}]] '{}' of the recipe{line}", kind.name(), step.name);
+    Error::config(what, problem, "correct its options")
+}
+
+/// Checks that the datasets to collect have the columns that the trainings on them read, such as images of the model's size.
+///
+/// # Errors
+/// When a column is missing, or has another shape.
+pub(super) fn check_columns(recipe: &Recipe, folder: &Path, columns: &Columns) -> Result<()> {
+    for step in &recipe.train {
+        let args: TrainArgs = parse(Kind::Train, step, &recipe.arguments(Kind::Train, step, folder))?;
+        if let Some(schema) = args.data.as_ref().and_then(|data| columns.get(Path::new(data))) {
+            args.config()?.check_columns(schema).map_err(|error| of_step(Kind::Train, step, &error))?;
+        }
     }
     Ok(())
 }

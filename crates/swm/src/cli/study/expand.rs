@@ -58,7 +58,7 @@ pub fn study(
         control.check()?;
         let Combination { starts, condition, policy, all } = combination;
         let within = |error| within(&condition, &policy, error);
-        let request = request(&all, &condition.name, &policy.name, resolver).map_err(within)?;
+        let request = request(&all, &condition.name, &policy, resolver).map_err(within)?;
         let inputs = inputs.of(&request).map_err(within)?;
         let any_seed = policy.any_seed.clone();
         let trained_on_starts = trained_on_starts(&request, &inputs, resolver).map_err(within)?;
@@ -88,8 +88,7 @@ pub fn check(file: &StudyFile, settings: &[String], resolver: &HomeResolver) -> 
     let mut seen = BTreeSet::new();
     for Combination { starts, condition, policy, all } in combinations(file, settings, resolver)? {
         if seen.insert([starts.name, policy.name.clone()]) {
-            request(&all, &condition.name, &policy.name, resolver)
-                .map_err(|error| within(&condition, &policy, error))?;
+            request(&all, &condition.name, &policy, resolver).map_err(|error| within(&condition, &policy, error))?;
         }
     }
     Ok(())
@@ -180,21 +179,23 @@ fn parsed(all: &Variant) -> Result<EvalArgs> {
     let matches = EvalArgs::augment_args(Command::new("swm eval")).try_get_matches_from(all.arguments());
     let parsed = matches.and_then(|matches| EvalArgs::from_arg_matches(&matches));
     parsed.map_err(|error| {
-        let text = usage::plain(&error);
-        let line = text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned();
-        Error::config("the options of a cell", line, "`swm eval --help` describes the options")
+        Error::config("the options of a cell", usage::on_one_line(&error), "`swm eval --help` describes the options")
     })
 }
 
 /// The request of a cell, with the names of the study.
-fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver) -> Result<EvalRequest> {
+fn request(all: &Variant, condition: &str, policy: &Variant, resolver: &HomeResolver) -> Result<EvalRequest> {
     let mut request = parsed(all)?.request(resolver, CapsuleStarts::Ignore)?;
     let [only] = &mut request.policies[..] else {
         let problem = format!("its options make {} policies, and a cell has one", request.policies.len());
         return Err(Error::config("the policy", problem, "give one policy and one solver; `each` makes several cells"));
     };
+    // Reports recognise the floor by its name.
     if only.kind != PolicyKind::Random {
-        policy.clone_into(&mut only.name);
+        policy.name.clone_into(&mut only.name);
+    } else if policy.name != only.name && policy.at != OF_THE_COMMAND {
+        let problem = format!("the random policy has the name '{}', and is always called '{}'", policy.name, only.name);
+        return Err(Error::config("the policy", problem, format!("write name = \"{}\"", only.name)));
     }
     request.conditions.iter_mut().for_each(|only| condition.clone_into(&mut only.name));
     Ok(request)

@@ -1,6 +1,7 @@
 //! Locates, verifies and opens the data files of a table.
 
 use super::lance_reader::{LanceReader, lock};
+use crate::dataset::Irregularity;
 use crate::dataset::objects::ObjectRanges;
 use crate::formats::lance::errors::damaged;
 use crate::formats::lance::record::{EPISODES_KEY, Record};
@@ -22,6 +23,9 @@ const OPENED_TOGETHER: usize = 16;
 
 /// Size in bytes up to which a data file is verified before any of its data is read, including the episode indices.
 const SMALL_FILE: u64 = 1 << 20;
+
+/// What is wrong with a data file that has another hash.
+pub(super) const OTHER_CONTENT: &str = "its content does not match the hash in its name";
 
 impl LanceReader {
     /// Opens data files in an object store concurrently, because opening one file takes several requests.
@@ -58,7 +62,8 @@ impl LanceReader {
     /// Verifies a local file against the hash in its name, once, before any of the file's data is decoded. Lance does
     /// not validate the file, so a flipped bit could cause an allocation of any size. A large file is verified only
     /// when data other than the episode indices is read (`reads_data`), so that opening a dataset does not read large
-    /// files completely. Object stores verify their content themselves.
+    /// files completely. Files in an object store are compared by [`LanceReader::false_names`] only, because reading a few of
+    /// their bytes would transfer all of them.
     pub(super) fn verify(&self, file: &DataFile, reads_data: bool) -> Result<()> {
         let Some(expected) = store::hash_in_name(&file.path).filter(|_| !self.store.remote) else { return Ok(()) };
         if lock(&self.verified).contains(&file.path) {
@@ -71,10 +76,43 @@ impl LanceReader {
             return Ok(());
         }
         if store::hash_file(&path).map_err(io)? != expected {
-            return Err(damaged(&path, "its content does not match the hash in its name"));
+            return Err(damaged(&path, OTHER_CONTENT));
         }
         lock(&self.verified).insert(file.path.clone());
         Ok(())
+    }
+
+    /// Finds the data files in an object store that do not have the hash in their name: their fragments and names.
+    pub(super) fn false_names(&self) -> Result<Vec<(usize, String)>> {
+        let mut found = vec![];
+        for (index, fragment) in self.table.fragments.iter().enumerate().filter(|_| self.store.remote) {
+            for file in &fragment.files {
+                let Some(expected) = store::hash_in_name(&file.path) else { continue };
+                if lock(&self.verified).contains(&file.path) {
+                    continue;
+                }
+                let path = self.store.data_path(&file.path);
+                if self.store.hash_object(&path).map_err(|error| self.explained(error))? == expected {
+                    lock(&self.verified).insert(file.path.clone());
+                } else {
+                    found.push((index, file.path.clone()));
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// Finds the episodes of data files in an object store that have other content than their name says.
+    pub(super) fn false_files(&self) -> Result<Vec<Irregularity>> {
+        let fragments: Vec<_> = self.episodes_of_fragments().collect();
+        let of_file = |(fragment, name): (usize, String)| {
+            let episodes = fragments[fragment].clone();
+            // A fragment may have rows of an earlier episode only.
+            let affected = if episodes.is_empty() { vec![None] } else { episodes.map(Some).collect() };
+            let what = format!("its data file {name}: {}", OTHER_CONTENT);
+            affected.into_iter().map(move |episode| Irregularity { episode, what: what.clone() })
+        };
+        Ok(self.false_names()?.into_iter().flat_map(of_file).collect())
     }
 
     pub(super) fn file_error(&self, path: &Path, error: std::io::Error) -> Error {

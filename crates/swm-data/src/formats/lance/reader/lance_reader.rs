@@ -1,7 +1,7 @@
 //! [`LanceReader`]: the state of an open table, and the caches that the modules of the reader share.
 
 use crate::dataset::Episode;
-use crate::dataset::objects::BlockCache;
+use crate::dataset::objects::{BlockCache, REPLACED};
 use crate::formats::lance::image_locations::ImageLocations;
 use crate::formats::lance::schema::StoredColumn;
 use crate::formats::lance::store::Store;
@@ -51,8 +51,14 @@ impl LanceReader {
         &self.store.label
     }
 
-    /// The error of a read, or that the files were replaced: then the newest version of the table lacks a data file of this one.
+    /// The error of a read, or that the files were replaced: then the store says so, or the newest version of the table
+    /// lacks a data file of this one.
     pub(super) fn explained(&self, error: Error) -> Error {
+        if self.store.remote && error.to_string().contains(REPLACED) {
+            let problem =
+                "its files were replaced since the dataset was opened, or several servers answer with other tags";
+            return Error::corrupt(self.folder(), problem, "open the dataset again, from one server");
+        }
         let files = |table: &Table| -> HashSet<String> {
             table.fragments.iter().flat_map(|fragment| &fragment.files).map(|file| file.path.clone()).collect()
         };

@@ -257,10 +257,12 @@ impl Reader for LanceReader {
         self.read_rows(name, ranges, out).map_err(|error| self.explained(error))
     }
 
-    /// Compares the content hash that is stated of each episode with its values, and the stored `step_idx` with the
-    /// position in the episode. The latter two differ if two episodes were written with the same index.
+    /// Compares data files in an object store with the hashes in their names (local ones are verified when they are read), the content
+    /// hash that is stated of each episode with its values, and the stored `step_idx` with the position in the episode. The latter
+    /// two differ if two episodes were written with the same index.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
-        let mut found = self.false_hashes()?;
+        let mut found = self.false_files()?;
+        found.extend(self.false_hashes()?);
         if self.table.schema.field(STEP_IDX).is_none() {
             return Ok(found);
         }
@@ -283,6 +285,13 @@ impl Reader for LanceReader {
             }
         }
         Ok(found)
+    }
+
+    fn check_files(&self) -> Result<()> {
+        match self.false_names()?.first() {
+            Some((_, name)) => Err(damaged(&self.folder().join("data").join(name), files::OTHER_CONTENT)),
+            None => Ok(()),
+        }
     }
 
     fn sources(&self) -> Vec<PathBuf> {

@@ -2,41 +2,34 @@
 //!
 //! It memorises a dataset and predicts nothing, so a model that solves no more starts has shown nothing but memory.
 
+mod view;
+
+use self::view::View;
 use crate::baselines::check_actions;
 use crate::starts::Starts;
 use std::collections::HashMap;
 use std::sync::Arc;
-use swm_core::columns::{ACTION, GOAL, GOAL_STATE, PIXELS, STATE};
+use swm_core::columns::ACTION;
 use swm_core::policy::write_action;
-use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Key, Policy, Result, RowMut, RowRef, Schema};
+use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowMut, RowRef, Schema};
 use swm_data::{Reader, StepRange};
 
 /// The number of actions between two searches.
 const CHUNK: usize = 5;
-/// The largest side of the grey frames that are compared, in cells.
-const SIDE: usize = 16;
 /// The number of rows that are read at once, as far as episodes are shorter.
 const ROWS: usize = 256;
 /// The largest number of compared values of a dataset: 2 GiB.
 const MAX_VALUES: usize = 1 << 29;
-
-/// What of a row is compared.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum View {
-    /// The column `state`, whose `angles` are replaced by their sines and cosines. Each value is divided by its standard
-    /// deviation in the dataset.
-    State { len: usize, angles: Vec<usize> },
-    /// The frame: the mean brightness of each of `side` x `side` cells.
-    Frame { side: usize },
-}
 
 /// The rows of a dataset in the form in which they are searched.
 pub(crate) struct Recordings {
     view: View,
     /// The number of values of a row.
     dim: usize,
-    /// `[rows, dim]`, scaled.
+    /// `[rows, dim]`, differences from `origin`, scaled.
     values: Vec<f32>,
+    /// The state in the first row, `[dim]`, so that an offset of all states does not matter; zeros for frames.
+    origin: Vec<f64>,
     /// The factor of each value, `[dim]`.
     scale: Vec<f32>,
     /// The actions, `[rows, action dim]`.
@@ -74,8 +67,15 @@ impl Recordings {
             let fix = "take starts from a dataset with fewer episodes";
             Error::config("policy 'nearest'", format!("{rows} rows of {dim} values are too many to compare"), fix)
         };
-        let mut recordings =
-            Self { scale: vec![1.0; dim], values: vec![], actions: vec![], episodes: vec![], view, dim };
+        let mut recordings = Self {
+            origin: vec![],
+            scale: vec![1.0; dim],
+            values: vec![],
+            actions: vec![],
+            episodes: vec![],
+            view,
+            dim,
+        };
         let count = rows.checked_mul(dim).filter(|&count| count <= MAX_VALUES).ok_or_else(too_many)?;
         recordings.values.try_reserve_exact(count).map_err(|_| too_many())?;
         recordings.actions.try_reserve_exact(rows.saturating_mul(spec.action_dim())).map_err(|_| too_many())?;
@@ -97,7 +97,12 @@ impl Recordings {
         let mut values = vec![0.0; self.dim];
         for row in 0..read.rows() {
             self.view.write(read.row(row), 0, &mut values);
-            self.values.extend_from_slice(&values);
+            if self.origin.is_empty() {
+                let is_state = matches!(self.view, View::State { .. });
+                let of_value = |value: &f64| if is_state && value.is_finite() { *value } else { 0.0 };
+                self.origin = values.iter().map(of_value).collect();
+            }
+            self.values.extend(values.iter().zip(&self.origin).map(|(value, origin)| (value - origin) as f32));
         }
         self.actions.extend(read.to_f32(ACTION)?);
         for range in ranges {
@@ -117,12 +122,19 @@ impl Recordings {
             let of_rows = || self.values.iter().skip(i).step_by(self.dim).map(|&value| f64::from(value));
             let mean = of_rows().sum::<f64>() / n;
             let deviation = (of_rows().map(|value| (value - mean).powi(2)).sum::<f64>() / n).sqrt();
-            let changes = deviation > 1e-6 * mean.abs().max(1e-6);
+            let mean = mean + self.origin.get(i).copied().unwrap_or_default();
+            let changes = self.view.changes(deviation, mean);
             *scale = if changes { (1.0 / deviation) as f32 } else { 0.0 };
         }
         for row in self.values.chunks_exact_mut(self.dim.max(1)) {
             scaled(row, &self.scale);
         }
+    }
+
+    /// Converts values as they are to those that are compared.
+    fn compare(&self, values: &[f64], to: &mut [f32]) {
+        let of_values = values.iter().zip(&self.origin).zip(&self.scale);
+        to.iter_mut().zip(of_values).for_each(|(to, ((value, origin), scale))| *to = (value - origin) as f32 * scale);
     }
 
     /// The row, outside of the episode at the position `except`, for which this row and the one `offset` rows later are
@@ -152,99 +164,6 @@ impl Recordings {
     /// Whether there is a row with another one `offset` rows later outside of the episode at a position.
     fn has_others(&self, offset: usize, except: usize) -> bool {
         self.episodes.iter().any(|episode| episode.position != except && episode.rows > offset)
-    }
-}
-
-impl View {
-    fn of(spec: &EnvSpec, infos: &Schema, stored: &Schema) -> Result<Self> {
-        let own = |name: &str| infos.find(name).map(|index| &infos.columns()[index]);
-        let recorded = |name: &str| stored.find(name).map(|index| &stored.columns()[index]);
-        let is_float = |column: &ColumnSpec| matches!(column.dtype, DType::Float32 | DType::Float64);
-        if let (Some(now), Some(goal), Some(state)) = (own(STATE), own(GOAL_STATE), recorded(STATE))
-            && [now, goal, state].iter().all(|column| is_float(column) && column.shape == now.shape)
-        {
-            let of_state = spec.angles.iter().filter(|(column, _)| *column == STATE);
-            return Ok(Self::State { len: now.len(), angles: of_state.map(|&(_, element)| element).collect() });
-        }
-        if let (Some(now), Some(goal), Some(frame)) = (own(PIXELS), own(GOAL), recorded(PIXELS))
-            && [now, goal, frame].iter().all(|column| column.is_image())
-        {
-            let sides = [now, goal, frame].into_iter().flat_map(|column| [column.shape[0], column.shape[1]]);
-            return Ok(Self::Frame { side: sides.fold(SIDE, usize::min) });
-        }
-        let problem = format!("{} and the dataset share neither states, with those of goals, nor frames", spec.id);
-        Err(Error::config("policy 'nearest'", problem, "collect a dataset in this environment with frames (--image)"))
-    }
-
-    /// The column that a dataset stores.
-    fn column(&self) -> &'static str {
-        match self {
-            Self::State { .. } => STATE,
-            Self::Frame { .. } => PIXELS,
-        }
-    }
-
-    /// The column of the goal in an environment.
-    fn goal(&self) -> &'static str {
-        match self {
-            Self::State { .. } => GOAL_STATE,
-            Self::Frame { .. } => GOAL,
-        }
-    }
-
-    fn dim(&self) -> usize {
-        match self {
-            Self::State { len, angles } => len + angles.len(),
-            Self::Frame { side } => side * side,
-        }
-    }
-
-    /// Writes the values of a column of a row, not scaled: `[dim]`.
-    fn write(&self, row: RowRef<'_>, column: usize, values: &mut [f32]) {
-        match self {
-            Self::State { angles, .. } => match row.schema().columns()[column].dtype {
-                DType::Float32 => write_state(row.at::<f32>(column).iter().map(|&v| f64::from(v)), angles, values),
-                _ => write_state(row.at::<f64>(column).iter().copied(), angles, values),
-            },
-            Self::Frame { side } => {
-                let shape = &row.schema().columns()[column].shape;
-                write_frame(row.at::<u8>(column), [shape[0], shape[1]], *side, values);
-            }
-        }
-    }
-}
-
-fn write_state(state: impl Iterator<Item = f64>, angles: &[usize], values: &mut [f32]) {
-    let mut at = values.iter_mut();
-    let mut put = |value: f64| {
-        if let Some(to) = at.next() {
-            *to = value as f32;
-        }
-    };
-    for (i, value) in state.enumerate() {
-        if angles.contains(&i) {
-            put(value.sin());
-            put(value.cos());
-        } else {
-            put(value);
-        }
-    }
-}
-
-/// Writes the mean brightness, 0 to 1, of `side` x `side` cells of an image `[height, width, 3]`.
-fn write_frame(rgb: &[u8], [height, width]: [usize; 2], side: usize, values: &mut [f32]) {
-    let edge = |cell: usize, length: usize| cell * length / side;
-    for (cell, value) in values.iter_mut().enumerate() {
-        let (y, x) = (cell / side, cell % side);
-        let (top, bottom) = (edge(y, height), edge(y + 1, height));
-        let (left, right) = (edge(x, width), edge(x + 1, width));
-        let sum: u64 = (top..bottom)
-            .map(|line| {
-                rgb[3 * (line * width + left)..3 * (line * width + right)].iter().map(|&v| u64::from(v)).sum::<u64>()
-            })
-            .sum();
-        let count = 3 * (bottom - top) * (right - left);
-        *value = sum as f32 / (255 * count.max(1)) as f32;
     }
 }
 
@@ -294,6 +213,8 @@ struct Slot {
     next: (usize, usize),
     /// The values of the present and of the goal, `[2, dim]`.
     query: Vec<f32>,
+    /// The values of one of them as they are, `[dim]`.
+    values: Vec<f64>,
     action: Vec<f64>,
     failed: Option<Error>,
 }
@@ -317,8 +238,12 @@ impl NearestPolicy {
             }
             sources.insert(starts.key(start), episode);
         }
-        let slot =
-            || Slot { query: vec![0.0; 2 * recordings.dim], action: vec![0.0; spec.action_dim()], ..Slot::default() };
+        let slot = || Slot {
+            query: vec![0.0; 2 * recordings.dim],
+            values: vec![0.0; recordings.dim],
+            action: vec![0.0; spec.action_dim()],
+            ..Slot::default()
+        };
         Ok(Self { slots: (0..slots).map(|_| slot()).collect(), recordings, goal_offset, sources })
     }
 }
@@ -350,9 +275,9 @@ impl Slot {
     fn act(&mut self, of: &Recordings, goal_offset: usize, row: RowRef<'_>, columns: [usize; 2]) -> Result<()> {
         if self.next.1 == 0 {
             let (now, goal) = self.query.split_at_mut(of.dim);
-            for (column, values) in columns.into_iter().zip([&mut *now, &mut *goal]) {
-                of.view.write(row, column, values);
-                scaled(values, &of.scale);
+            for (column, query) in columns.into_iter().zip([&mut *now, &mut *goal]) {
+                of.view.write(row, column, &mut self.values);
+                of.compare(&self.values, query);
             }
             let remaining = goal_offset - self.step % goal_offset;
             let found = self.source.and_then(|source| of.nearest(now, goal, remaining, source));
@@ -375,6 +300,9 @@ impl Slot {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use swm_core::columns::STATE;
+    use swm_core::{ColumnSpec, DType};
+    use swm_data::{Constants, ReplayBuffer};
 
     /// Recordings of states of one dimension, which are scaled by 1.
     fn recordings(episodes: &[&[f32]]) -> Recordings {
@@ -384,8 +312,9 @@ mod tests {
             Episode { position, first: first - values.len(), rows: values.len() }
         });
         Recordings {
-            view: View::State { len: 1, angles: vec![] },
+            view: View::State { len: 1, angles: vec![], single: false },
             dim: 1,
+            origin: vec![0.0],
             scale: vec![1.0],
             episodes: of.collect(),
             actions: vec![],
@@ -408,33 +337,6 @@ mod tests {
     }
 
     #[test]
-    fn states_are_compared_before_frames() {
-        let spec = EnvSpec {
-            id: "test/Env-v0".to_owned(),
-            action_space: swm_core::Space::uniform_box([1], DType::Float32, -1.0, 1.0),
-            columns: vec![],
-            observation_space: vec![],
-            variation_space: swm_core::VariationSpace::new(vec![], &[]),
-            max_episode_steps: 9,
-            cameras: vec![],
-            angles: vec![(STATE, 1), (GOAL_STATE, 1), ("other", 0)],
-        };
-        let state = |name: &str, len: usize| ColumnSpec::new(name, DType::Float64, [len]);
-        let frame = |name: &str, side| ColumnSpec::image(name, side, 40);
-        let schema = |columns: Vec<ColumnSpec>| Schema::new(columns).expect("a schema");
-        let own = schema(vec![state(STATE, 3), state(GOAL_STATE, 3), frame(PIXELS, 30), frame(GOAL, 30)]);
-        let view = |own: &Schema, stored: Vec<ColumnSpec>| View::of(&spec, own, &schema(stored));
-        let found = view(&own, vec![state(STATE, 3), frame(PIXELS, 30)]).expect("a view");
-        assert_eq!((&found, found.dim()), (&View::State { len: 3, angles: vec![1] }, 4));
-        let found = view(&own, vec![state(STATE, 2), frame(PIXELS, 12)]).expect("a view");
-        assert_eq!((&found, found.dim()), (&View::Frame { side: 12 }, 144));
-        let found = view(&schema(vec![frame(PIXELS, 30), frame(GOAL, 30)]), vec![state(STATE, 3), frame(PIXELS, 90)]);
-        assert_eq!(found.expect("a view"), View::Frame { side: SIDE });
-        let error = view(&own, vec![state(STATE, 2)]).expect_err("nothing in common");
-        assert!(error.is_usage() && error.to_string().contains("frames"), "{error}");
-    }
-
-    #[test]
     fn distances_of_any_length_are_those_of_the_definition() {
         for len in [0, 1, 7, 8, 9, 256] {
             let [a, b]: [Vec<f32>; 2] = [3, 5].map(|k| (0..len).map(|i| ((i * k) % 11) as f32).collect());
@@ -445,29 +347,37 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_any_size_become_the_mean_brightness_of_cells() {
-        // The left half is white; 5 columns: cells of 2 and 3 columns.
-        let image = |[height, width]: [usize; 2]| -> Vec<u8> {
-            (0..height * width).flat_map(|i| [if i % width < 2 { 255 } else { 0 }; 3]).collect()
+    fn an_offset_of_all_states_does_not_matter() {
+        let column = |name: &str, dtype| ColumnSpec::new(name, dtype, [1]);
+        let schema = Schema::new([column(STATE, DType::Float64), column(ACTION, DType::Float32)]).expect("a schema");
+        let values = |offset: f64| {
+            let mut rows = Batch::zeros(&schema, 3);
+            for (row, state) in [0.0, 0.25, 0.5].into_iter().enumerate() {
+                rows.row_mut(row).set(0, &[state + offset]);
+            }
+            rows.row_mut(2).set(1, &[f32::NAN]);
+            let replay = ReplayBuffer::new(&schema, 10).expect("a buffer");
+            replay.add(&rows, &Constants::default()).expect("an episode");
+            let mut data = recordings(&[]);
+            data.origin.clear();
+            data.append(&*replay.snapshot(), &[StepRange::new(0, 0, 3)]).expect("its rows");
+            data.standardise();
+            let mut query = [0.0];
+            data.compare(&[0.25 + offset], &mut query);
+            assert_eq!(query[0], data.values[1]);
+            data.values
         };
-        let mut values = [9.0; 4];
-        write_frame(&image([3, 5]), [3, 5], 2, &mut values);
-        assert_eq!(values, [1.0, 0.0, 1.0, 0.0]);
-        write_frame(&image([4, 8]), [4, 8], 2, &mut values);
-        assert_eq!(values, [0.5, 0.0, 0.5, 0.0]);
-    }
-
-    #[test]
-    fn angles_are_compared_on_the_circle() {
-        let mut values = [0.0; 4];
-        write_state([7.0, std::f64::consts::PI, 2.0].into_iter(), &[1], &mut values);
-        assert!(values[0] == 7.0 && values[1].abs() < 1e-6 && values[2] == -1.0 && values[3] == 2.0, "{values:?}");
+        assert_eq!(values(f64::from(1 << 30)), values(0.0));
+        let data = recordings(&[]);
+        let single = View::State { len: 1, angles: vec![], single: true };
+        assert!(data.view.changes(0.2, 1e9) && !data.view.changes(0.01, 1e9) && !data.view.changes(1e-7, 1.0));
+        assert!(data.view.changes(1e-5, 300.0) && !single.changes(1e-5, 300.0), "the noise of single precision");
     }
 
     #[test]
     fn values_that_never_change_are_not_compared() {
         let mut data = recordings(&[&[4.0, 1.0, 4.0, 3.0, 4.0, 5.0]]);
-        (data.dim, data.scale) = (2, vec![1.0; 2]);
+        (data.dim, data.scale, data.origin) = (2, vec![1.0; 2], vec![0.0; 2]);
         data.standardise();
         // The variance of 1, 3, 5 is 8 / 3.
         assert_eq!(data.scale[0], 0.0);

@@ -201,7 +201,7 @@ macro_rules! value_learner {
 
             fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
                 let inputs = (&config.model.encoder, &config.model.pixels());
-        self.encoder = weights::encoder::fill(self.encoder, inputs, &config.model.weights, cache)?;
+                self.encoder = weights::encoder::fill(self.encoder, inputs, &config.model.weights, cache)?;
                 Ok(self)
             }
 

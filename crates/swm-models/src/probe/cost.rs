@@ -63,7 +63,10 @@ impl StateProbe {
         let map =
             if mean(&scores[1]) > mean(&scores[0]) { Map::Network(Box::new(network)) } else { Map::Linear(linear) };
         let (_, std) = mean_and_std(&y, rows);
-        let spread: Vec<f32> = std.iter().map(|std| if *std > 1e-9 { *std as f32 } else { f32::INFINITY }).collect();
+        let spread: Vec<f32> = std
+            .iter()
+            .map(|std| if *std > 0.0 { (*std as f32).max(f32::MIN_POSITIVE) } else { f32::INFINITY })
+            .collect();
         if spread.iter().all(|spread| spread.is_infinite()) {
             let fix = "name columns that vary, or collect episodes that differ";
             return Err(Error::config("the columns of a probe", "all of them are constant", fix));

@@ -37,7 +37,7 @@ impl Ridge {
         let (mean_x, std) = mean_and_std(x, rows);
         let (mean_y, _) = mean_and_std(y, rows);
         // A constant feature gets no weight.
-        let scale: Vec<f64> = std.iter().map(|&s| if s > 1e-12 { 1.0 / s } else { 0.0 }).collect();
+        let scale: Vec<f64> = std.iter().map(|&s| if s > 0.0 { 1.0 / s } else { 0.0 }).collect();
         let x: Vec<f64> =
             x.iter().enumerate().map(|(i, &v)| (f64::from(v) - mean_x[i % features]) * scale[i % features]).collect();
         let y: Vec<f64> = y.iter().enumerate().map(|(i, &v)| f64::from(v) - mean_y[i % targets]).collect();
@@ -86,7 +86,7 @@ impl Ridge {
     }
 }
 
-/// Computes mean and standard deviation of every column.
+/// Computes mean and standard deviation of every column; the deviation of equal values is exactly 0.
 ///
 /// # Shapes
 /// `x` is `[rows, width]`; returns `[width]` twice.
@@ -97,11 +97,13 @@ pub(super) fn mean_and_std(x: &[f32], rows: usize) -> (Vec<f64>, Vec<f64>) {
         mean.iter_mut().zip(row).for_each(|(sum, &v)| *sum += f64::from(v));
     }
     mean.iter_mut().for_each(|sum| *sum /= rows as f64);
-    let mut square = vec![0.0f64; width];
+    let (mut square, mut varies) = (vec![0.0f64; width], vec![false; width]);
     for row in x.chunks_exact(width) {
+        varies.iter_mut().zip(row).zip(x).for_each(|((varies, value), first)| *varies |= value != first);
         square.iter_mut().zip(row).zip(&mean).for_each(|((sum, &v), mean)| *sum += (f64::from(v) - mean).powi(2));
     }
-    (mean, square.into_iter().map(|sum| (sum / rows as f64).sqrt()).collect())
+    let std = square.into_iter().zip(varies).map(|(sum, varies)| if varies { (sum / rows as f64).sqrt() } else { 0.0 });
+    (mean, std.collect())
 }
 
 /// Transposes a matrix.

@@ -12,7 +12,7 @@ impl Scale {
     /// Computes the scale of a table `[rows, width]`; a constant column is centred only.
     pub fn of(table: &[f32], rows: usize) -> Self {
         let (mean, std) = mean_and_std(table, rows);
-        Self { mean, std: std.into_iter().map(|s| if s > 1e-12 { s } else { 1.0 }).collect() }
+        Self { mean, std: std.into_iter().map(|s| if s > 0.0 { s } else { 1.0 }).collect() }
     }
 
     /// Returns the number of columns.

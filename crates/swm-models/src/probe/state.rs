@@ -256,7 +256,7 @@ pub(super) fn scores(targets: &[Target], predictions: &[f32], values: &[f32]) ->
         let errors = || predictions.iter().zip(values).skip(i).step_by(width).map(|(a, b)| f64::from(a - b));
         let square = errors().map(|e| e * e).sum::<f64>() / count;
         let (column, index, part, spread) = (column.clone(), *index, *part, spread[i]);
-        let r2 = (spread > 1e-9).then(|| 1.0 - square / spread.powi(2));
+        let r2 = (spread > 0.0).then(|| 1.0 - square / spread.powi(2));
         let (rmse, mae) = (square.sqrt(), errors().map(f64::abs).sum::<f64>() / count);
         Score { column, index, part, spread, r2, rmse, mae }
     };
@@ -272,7 +272,7 @@ fn explained_variance(predictions: &[f32], values: &[f32], rows: usize) -> Optio
     let (_, std) = mean_and_std(values, rows);
     let variance = std.iter().map(|std| std * std).sum::<f64>() * rows as f64;
     let error: f64 = predictions.iter().zip(values).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-    (variance > 1e-12).then(|| 1.0 - error / variance)
+    (variance > 0.0).then(|| 1.0 - error / variance)
 }
 
 #[cfg(test)]
@@ -288,6 +288,18 @@ mod tests {
         // The variance of 0, 3, 6 is 6.
         assert!((scores[0].r2.expect("a coefficient of determination") - (1.0 - 2.0 / 3.0 / 6.0)).abs() < 1e-9);
         assert!(scores[1].r2.is_none() && scores[1].mae == 0.0);
+    }
+
+    #[test]
+    fn values_of_any_unit_are_scored_alike() {
+        let names = [Target { column: "x".to_owned(), index: 0, part: None }];
+        let score = |unit: f32| {
+            let [predictions, targets] = [[1.0, 2.0, 6.0], [0.0, 3.0, 6.0]].map(|values| values.map(|v: f32| v * unit));
+            scores(&names, &predictions, &targets)[0].r2.expect("the values vary")
+        };
+        assert!((score(1.0) - score(1e-12)).abs() < 1e-5);
+        // A third has no exact mean in binary.
+        assert!(scores(&names, &[1.0; 3], &[1.0 / 3.0; 3])[0].r2.is_none());
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! [`DinoWmCost`]: the planning cost of a DINO-WM, the mean squared distance between the last predicted patches of a
-//! candidate and the patches of the goal image. If the goal of a column is given (`goal_proprio` for `proprio`), the
+//! candidate, or the closest ones, and the patches of the goal image. If the goal of a column is given (`goal_proprio` for `proprio`), the
 //! mean squared distance between the predicted features and the goal features of the column is added.
 //!
 //! Every environment is evaluated in calls whose shapes do not depend on the other environments, so the
@@ -24,6 +24,8 @@ pub struct DinoWmCost {
     config: DinoWmConfig,
     dataset_info: DatasetInfo,
     action_dim: usize,
+    /// Whether the cost is that of the closest predicted frame, not of the last one.
+    closest: bool,
     contexts: Vec<PlanContext>,
 }
 
@@ -39,8 +41,10 @@ struct PlanContext {
     columns: Vec<(std::ops::Range<usize>, Tensor<2>)>,
 }
 
-/// The number of candidates in a rollout call. A frame has many tokens, so a few candidates fill a core's cache.
-const CHUNK_SIZE: usize = 16;
+/// The number of tokens in the windows of a rollout call: enough for efficient matrix products, few enough for a core's cache.
+const CHUNK_TOKENS: usize = 256;
+/// The least and the largest number of candidates in a rollout call.
+const CHUNK_SIZES: (usize, usize) = (16, 160);
 
 impl DinoWmCost {
     /// Creates the planning cost of a trained model.
@@ -50,6 +54,7 @@ impl DinoWmCost {
             config: checkpoint.config.model.clone(),
             dataset_info: checkpoint.dataset_info.clone(),
             action_dim: checkpoint.action_dim(),
+            closest: false,
             contexts: vec![],
         }
     }
@@ -65,6 +70,14 @@ impl DinoWmCost {
     /// Checks that the lengths of candidates and costs fit the observed environments.
     fn check_sizes(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
         checks::candidate_sizes("costs of a DINO-WM", candidates, costs, [self.contexts.len(), self.action_dim])
+    }
+
+    /// Returns the number of candidates in a rollout call: equal parts of `samples`. It does not depend on the machine, because
+    /// the rounding of products could depend on it.
+    fn chunk_size(&self, samples: usize) -> usize {
+        let window = self.config.patches() * self.config.predictor.history;
+        let most = (CHUNK_TOKENS / window.max(1)).clamp(CHUNK_SIZES.0, CHUNK_SIZES.1);
+        samples.div_ceil(samples.div_ceil(most).max(1)).max(1)
     }
 
     /// Encodes the current frame, the recorded history and the goal of one environment.
@@ -119,14 +132,15 @@ impl DinoWmCost {
 }
 
 impl PlanContext {
-    /// Returns the costs of candidates, in the autodiff graph of the candidates if there is one.
+    /// Returns the costs of candidates, in the autodiff graph of the candidates if there is one: of the last frame, or of the
+    /// `closest` one.
     ///
     /// # Shapes
     /// `candidates` is `[samples, horizon, action_dim]`; returns `[samples]`.
-    fn cost(&self, model: &DinoWm, candidates: Tensor<3>) -> Tensor<1> {
+    fn cost(&self, model: &DinoWm, candidates: Tensor<3>, closest: bool) -> Tensor<1> {
         // If the candidates are in an autodiff graph, all operands must be in the graph.
         let differentiated = candidates.is_autodiff();
-        let [samples, _, elements] = candidates.dims();
+        let [samples, horizon, elements] = candidates.dims();
         let [_, frames, patches, dim] = self.start.dims();
         let past = TensorData::new(self.past.repeat(samples), [samples, frames - 1, elements]);
         let past = Tensor::<3>::from_data(past, &self.start.device());
@@ -136,17 +150,22 @@ impl PlanContext {
         let actions = if frames > 1 { Tensor::cat(vec![past, candidates], 1) } else { candidates };
         let [_, steps, _] = actions.dims();
         let all = model.rollout(start.expand([samples, frames, patches, dim]), actions);
-        let end = all.slice([0..samples, steps..steps + 1, 0..patches, 0..dim]).reshape([samples, patches, dim]);
+        let compared = if closest { horizon } else { 1 };
+        let ends = all.slice([0..samples, steps + 1 - compared..steps + 1, 0..patches, 0..dim]);
         let [_, _, width] = goal.dims();
-        let squared = (end.clone().slice([0..samples, 0..patches, 0..width]) - goal).square();
-        let mut cost = squared.reshape([samples, patches * width]).mean_dim(1);
+        let part = |patches: usize, span: std::ops::Range<usize>| {
+            let features = span.len();
+            let part = ends.clone().slice([0..samples, 0..compared, 0..patches, span]);
+            part.reshape([samples, compared, patches * features])
+        };
+        let mut cost = (part(patches, 0..width) - goal.reshape([1, 1, patches * width])).square().mean_dim(2);
         for (span, goal) in &self.columns {
             // Every patch of a recorded frame has the same column features, so, as published, only the first patch is
             // compared.
             let goal = if differentiated { goal.clone().autodiff() } else { goal.clone() };
-            let predicted = end.clone().slice([0..samples, 0..1, span.clone()]).reshape([samples, span.len()]);
-            cost = cost + (predicted - goal).square().mean_dim(1);
+            cost = cost + (part(1, span.clone()) - goal.unsqueeze_dim(0)).square().mean_dim(2);
         }
+        let cost = if closest { cost.min_dim(1) } else { cost };
         cost.reshape([samples])
     }
 }
@@ -162,18 +181,24 @@ impl CostModel for DinoWmCost {
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.check_sizes(&candidates, costs)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
-        let (model, candidate_len) = (&self.model, horizon * dim);
+        let (model, closest, candidate_len) = (&self.model, self.closest, horizon * dim);
+        let chunk_size = self.chunk_size(samples);
         let work = costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * candidate_len)).zip(&self.contexts);
         work.for_each(|((costs, actions), context)| {
-            costs.par_chunks_mut(CHUNK_SIZE).zip(actions.par_chunks(CHUNK_SIZE * candidate_len)).for_each(
+            costs.par_chunks_mut(chunk_size).zip(actions.par_chunks(chunk_size * candidate_len)).for_each(
                 |(costs, actions)| {
                     let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
-                    let found = context.cost(model, Tensor::from_data(data, &context.start.device()));
+                    let found = context.cost(model, Tensor::from_data(data, &context.start.device()), closest);
                     costs.copy_from_slice(&found.into_data().into_f32_vec());
                 },
             );
         });
         Ok(())
+    }
+
+    fn compare_closest(&mut self) -> bool {
+        self.closest = true;
+        true
     }
 
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
@@ -194,14 +219,15 @@ impl DifferentiableCost for DinoWmCost {
         }
         // Only the candidates are differentiated; the weights are constants.
         let (model, candidate_len) = (self.model.clone().train().no_grad(), horizon * dim);
+        let (closest, chunk_size) = (self.closest, self.chunk_size(samples));
         let envs = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * candidate_len));
         envs.zip(actions.par_chunks(samples * candidate_len)).zip(&self.contexts).for_each(
             |(((costs, gradient), actions), context)| {
-                let chunks = costs.par_chunks_mut(CHUNK_SIZE).zip(gradient.par_chunks_mut(CHUNK_SIZE * candidate_len));
-                chunks.zip(actions.par_chunks(CHUNK_SIZE * candidate_len)).for_each(|((costs, gradient), actions)| {
+                let chunks = costs.par_chunks_mut(chunk_size).zip(gradient.par_chunks_mut(chunk_size * candidate_len));
+                chunks.zip(actions.par_chunks(chunk_size * candidate_len)).for_each(|((costs, gradient), actions)| {
                     let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
                     let leaf = Tensor::<3>::from_data(data, &context.start.device()).autodiff().require_grad();
-                    let found = context.cost(&model, leaf.clone());
+                    let found = context.cost(&model, leaf.clone(), closest);
                     costs.copy_from_slice(&found.clone().inner().into_data().into_f32_vec());
                     match leaf.grad(&found.sum().backward()) {
                         Some(found) => gradient.copy_from_slice(&found.into_data().into_f32_vec()),

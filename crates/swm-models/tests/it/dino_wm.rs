@@ -274,3 +274,48 @@ fn history_and_column_goals_change_the_cost() {
     let message = model.observe(&infos(&[]), &[0]).expect_err("infos without a position").to_string();
     assert!(message.contains("position"), "{message}");
 }
+
+#[test]
+fn the_closest_frame_is_the_last_one_of_the_cheapest_shorter_plan() {
+    // Predictions of random weights are far from every goal, the first ones least.
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let settings = [IMAGES, "schedule.steps=150", "optim.lr=3e-3", "model.predictor.dropout=0"];
+    run(&config(&settings).expect("loading the configuration"), folder.path(), 2).expect("training the model");
+    let trained = Checkpoint::<DinoWm>::load(folder.path(), &crate::device()).expect("loading the checkpoint");
+    let all = candidates();
+    let mut steps = std::collections::BTreeSet::new();
+    for (checkpoint, extra) in [(&trained, &[][..]), (&checkpoint(&[POSITIONS]), &["position", "goal_position"])] {
+        let infos = infos(extra);
+        for env in 0..ENVS {
+            let cost = |horizon: usize, closest: bool| {
+                let of_env = all[env * SAMPLES * HORIZON * DIM..][..SAMPLES * HORIZON * DIM].chunks(HORIZON * DIM);
+                let shorter: Vec<f32> = of_env.flat_map(|all| all[..horizon * DIM].to_vec()).collect();
+                let mut model = DinoWmCost::new(checkpoint);
+                assert!(!closest || model.compare_closest());
+                model.observe(&infos, &[env]).expect("observing the environment");
+                let candidates = Candidates { actions: &shorter, envs: 1, samples: SAMPLES, horizon, dim: DIM };
+                let (mut costs, mut again) = (vec![f32::NAN; SAMPLES], vec![f32::NAN; SAMPLES]);
+                let mut gradient = vec![f32::NAN; shorter.len()];
+                model.cost(candidates, &mut costs).expect("computing the costs");
+                let differentiable = model.differentiable().expect("a differentiable cost");
+                differentiable.cost_and_gradient(candidates, &mut again, &mut gradient).expect("computing gradients");
+                for (cost, again) in costs.iter().zip(&again) {
+                    assert!((cost - again).abs() < 1e-4 * cost, "cost {cost}, with its gradient {again}");
+                }
+                (costs, gradient)
+            };
+            let (closest, gradient) = cost(HORIZON, true);
+            let shorter: Vec<Vec<f32>> = (1..=HORIZON).map(|horizon| cost(horizon, false).0).collect();
+            for sample in 0..SAMPLES {
+                let of = |step: usize| shorter[step][sample];
+                let step = (0..HORIZON).min_by(|&a, &b| of(a).total_cmp(&of(b))).expect("steps");
+                assert!((closest[sample] - of(step)).abs() < 1e-5 * of(step), "{} of {shorter:?}", closest[sample]);
+                let gradient = &gradient[sample * HORIZON * DIM..][..HORIZON * DIM];
+                assert!(gradient[..DIM].iter().any(|&slope| slope != 0.0));
+                assert!(gradient[(step + 1) * DIM..].iter().all(|&slope| slope == 0.0), "later actions have no effect");
+                steps.insert(step);
+            }
+        }
+    }
+    assert!(steps.len() > 1, "all plans are closest after step {steps:?}");
+}

@@ -22,7 +22,9 @@ use swm_core::{Error, Origin, Result, files};
 const SHIPPED: &[(&str, &str)] = &[
     ("ogb-cube/gcbc", include_str!("../../../recipes/ogb-cube/gcbc.toml")),
     ("ogb-cube/lewm", include_str!("../../../recipes/ogb-cube/lewm.toml")),
+    ("push-t/dino-wm", include_str!("../../../recipes/push-t/dino-wm.toml")),
     ("push-t/gcbc", include_str!("../../../recipes/push-t/gcbc.toml")),
+    ("push-t/gciql", include_str!("../../../recipes/push-t/gciql.toml")),
     ("push-t/gcivl", include_str!("../../../recipes/push-t/gcivl.toml")),
     ("push-t/lewm", include_str!("../../../recipes/push-t/lewm.toml")),
     ("push-t/pldm", include_str!("../../../recipes/push-t/pldm.toml")),

@@ -6,7 +6,6 @@ use crate::errors::{json, signal_poll, to_py_err};
 use crate::exit;
 use crate::model::Model;
 use crate::observer::PythonObserver;
-use crate::world::plan_key;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -90,7 +89,9 @@ pub fn solve<'py>(
             plans.len()
         )));
     }
-    let keys: Vec<Key> = plans.iter().map(|&(first, second)| plan_key(seed).at(first).at(second)).collect();
+    // Plans outside of episodes have a key of their own.
+    let key = Key::new(seed).with("solve");
+    let keys: Vec<Key> = plans.iter().map(|&(first, second)| key.at(first).at(second)).collect();
     let problem = PlanProblem { horizon, space, keys: &keys, init: init.as_deref(), deadline, observer: None };
     let observer = observer.map(PythonObserver::new);
     let observer = observer.as_ref().map(|observer| observer as &dyn SearchObserver);

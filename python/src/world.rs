@@ -20,7 +20,7 @@ use swm::core::columns::{TERMINATED, TRUNCATED};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
 use swm::core::run::Control;
-use swm::core::{Callable, CameraView, Env, Error, Key, Manifest, Origin, ResetOptions, VariationRequest};
+use swm::core::{Callable, CameraView, Env, Error, Manifest, Origin, ResetOptions, VariationRequest};
 use swm::data::{ImageCodec, Location, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm::eval::{CollectConfig, EvalConfig, PolicyChoice, Starts, Videos, WorldConfig, episode_key, reset_seed};
@@ -287,6 +287,11 @@ impl World {
         exit::detached(py, || world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(to_py_err)
     }
 
+    /// Checks that datasets can hold all actions of the environments.
+    fn check_storable(&self) -> PyResult<()> {
+        swm::data::check_storable(self.lock()?.spec()).map_err(to_py_err)
+    }
+
     /// Collects episodes into a dataset at `path`, or into `writer`, an object with `write_episode`. Returns
     /// `(episodes, added, steps, warning)`; the warning lists the columns with NaN or infinite values, if there are any.
     #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
@@ -489,9 +494,4 @@ pub fn factors<'py>(py: Python<'py>, env: &dyn Env) -> PyResult<Bound<'py, PyDic
         dict.set_item(key, value.to_vec())?;
     }
     Ok(dict)
-}
-
-/// The random key of plans made outside of episodes.
-pub fn plan_key(seed: u64) -> Key {
-    Key::new(seed).with("solve")
 }

@@ -346,7 +346,7 @@ class MPCPolicy(BasePolicy):
     Args:
         solver: A solver of `swm.solver`, or an object with `configure` and `solve`.
         config: The planning config; by default 5 model steps, all of them executed, with the model's `action_block` (1 if the
-            model has none).
+            model has none) and one frame of history (`model.card["history"]` is what a model was trained with).
         process: Scalers by column, applied before the model (`transform`); the scaler of `action` converts planned actions
             back (`inverse_transform`). `None` for those of the model (`model.process`), which torch modules of checkpoints
             have.

@@ -180,6 +180,16 @@ def test_dataset_names_are_resolved_in_the_home_folder(tmp_path, monkeypatch):
     assert data.load_dataset("rooms", cache_dir=tmp_path).lengths.tolist() == [5]
 
 
+@pytest.mark.parametrize("name", ["", " ", "lerobot://"])
+def test_an_empty_name_is_no_dataset(tmp_path, monkeypatch, name):
+    write(tmp_path / "only.lance", (5,))
+    (tmp_path / "datasets").mkdir()
+    monkeypatch.chdir(tmp_path)
+    for cache_dir in (None, tmp_path):
+        with pytest.raises(ValueError, match="it is empty|names no repository"):
+            data.load_dataset(name, cache_dir=cache_dir)
+
+
 def test_numpy_backend_does_not_import_torch(stored):
     path, _, _ = stored
     program = (

@@ -300,4 +300,12 @@ pub trait Solver: Send {
     fn check(&self) -> Result<()> {
         Ok(())
     }
+
+    /// Checks that the settings fit the actions of a model step, before any problem is solved.
+    ///
+    /// # Errors
+    /// When a setting does not fit the actions.
+    fn check_space(&self, _space: PlanSpace<'_>) -> Result<()> {
+        Ok(())
+    }
 }

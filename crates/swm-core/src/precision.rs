@@ -7,6 +7,8 @@ use crate::{DType, Error, Result};
 const SMALLEST: f64 = 1e4;
 /// The standard deviation up to which values count as constant.
 pub const CONSTANT: f64 = 1e-6;
+/// The standard deviation up to which values that should be zero are noise of a simulator.
+pub const NOISE: f64 = 1e-14;
 /// The largest rounding error, in standard deviations.
 const LARGEST_ERROR: f64 = 1e-2;
 /// Whole numbers up to this magnitude are single-precision numbers.

@@ -15,8 +15,8 @@ pub mod tools;
 pub use dataset::{
     BatchSlice, CacheConfig, ClipSpec, Clips, ColumnStats, CommitPolicy, Constants, Continued, Episode, Epoch,
     GoalMixture, GoalSpec, Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Mark, Part, Reader, ReplayBuffer,
-    ReplayConfig, ReplayLoader, Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats,
-    goals, objects, views,
+    ReplayConfig, ReplayLoader, Split, StepRange, WriteMode, WriteOptions, Writer, check_storable, column_quantiles,
+    column_stats, goals, objects, views,
 };
 pub use formats::{FORMATS, FormatEntry, create, has_no_dataset, lance, open, recover};
 pub use swm_image::{self as image, ImageCodec, RgbImage, check_png, write_png};

@@ -38,7 +38,7 @@ use swm_core::run::{Control, Progress};
 use swm_core::{
     Batch, ColumnSpec, DType, EnvPool, EnvSpec, Error, Key, Manifest, Policy, Result, Schema, VariationRequest, limits,
 };
-use swm_data::{Constants, Writer};
+use swm_data::{Constants, Writer, check_storable};
 
 /// Settings of a collection.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -83,7 +83,8 @@ impl World {
     /// The columns of a dataset collected in this world.
     ///
     /// # Errors
-    /// When a column of the environment has the name of a collected column, or its actions cannot have the noise.
+    /// When a column of the environment has the name of a collected column, its actions cannot have the noise, or datasets
+    /// cannot hold them.
     pub fn collect_schema(&self, config: &CollectConfig) -> Result<Schema> {
         action_noise::check(config.action_noise, self.spec())?;
         Layout::of(self.pool().infos().schema(), self.spec(), config).map(|layout| layout.schema)
@@ -239,6 +240,7 @@ struct Layout {
 
 impl Layout {
     fn of(infos: &Schema, spec: &EnvSpec, config: &CollectConfig) -> Result<Self> {
+        check_storable(spec)?;
         let mut columns: Vec<ColumnSpec> = vec![];
         let mut observed = vec![];
         let copied = |name: &str| match name {

@@ -1,4 +1,4 @@
-//! [`check_continues`]: whether a collection may continue a dataset.
+//! [`check_continues`]: whether a collection may continue a dataset; and [`difference`]: how two collections differ.
 
 use serde_json::Value;
 use std::collections::BTreeSet;
@@ -10,12 +10,34 @@ use swm_core::{Error, Manifest, Result};
 /// # Errors
 /// When a setting differs; the message names the setting.
 pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
-    let differs = |what: &str, stored: String, wanted: String| {
-        Err(Error::config(
-            format!("continuing a collection with {what} {wanted}"),
-            format!("its episodes were collected with {what} {stored}"),
-            "use the same settings (--codec, --wrapper, … on the command line), or collect into another dataset",
-        ))
+    let Some(found) = difference(stored, wanted) else { return Ok(()) };
+    let fix = "use the same settings (--codec, --wrapper, … on the command line), or collect into another dataset";
+    Err(Error::config(format!("continuing a collection with {} {}", found.setting, found.wanted), found.problem(), fix))
+}
+
+/// A setting in which a dataset differs from a collection.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Difference {
+    /// The name of the setting: `policy`.
+    pub setting: String,
+    /// The setting of the dataset.
+    pub stored: String,
+    /// The setting of the collection.
+    pub wanted: String,
+}
+
+impl Difference {
+    /// What is wrong with the dataset.
+    pub fn problem(&self) -> String {
+        format!("its episodes were collected with {} {}", self.setting, self.stored)
+    }
+}
+
+/// Returns a setting, or the weights of a policy, in which a dataset differs from a collection; `None` if all are equal but the
+/// number of episodes.
+pub fn difference(stored: &Manifest, wanted: &Manifest) -> Option<Difference> {
+    let differs = |setting: &str, stored: String, wanted: String| {
+        Some(Difference { setting: setting.to_owned(), stored, wanted })
     };
     if stored.seed != wanted.seed {
         return differs("seed", stored.seed.to_string(), wanted.seed.to_string());
@@ -33,7 +55,7 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
             return differs(&format!("the weights of {policy}"), stored.clone(), wanted.clone());
         }
     }
-    Ok(())
+    None
 }
 
 /// Returns a setting of a collection. A setting that is left out, empty or false is the same as null: older manifests and

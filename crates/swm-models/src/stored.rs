@@ -199,7 +199,7 @@ impl StoredCheckpoint {
     /// Checks the hash of `config.json` if the manifest has one, and that the manifest of a training repeats its settings:
     /// statistics of the data and settings of the frames change what a model computes without changing its weights. A capsule
     /// is checked where it is read.
-    fn check_config(&self) -> Result<()> {
+    pub(crate) fn check_config(&self) -> Result<()> {
         let Some(found) = &self.config_hash else { return Ok(()) };
         if self.manifest.hashes.get("config").is_some_and(|expected| expected != found) {
             return Err(self.broken(format!("is not the file that {MANIFEST} describes: the hash differs")));

@@ -56,6 +56,9 @@ def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | N
     if text.startswith("hf://"):
         return _engine.find_dataset(text)
     uri, text = text, text.removeprefix("lerobot://")
+    if not text.strip():
+        # An empty path would be the current folder; the engine says what is missing.
+        return _engine.find_dataset(uri)
     if "://" in text:
         return text
     datasets = Path(_engine.home() if cache_dir is None else cache_dir).expanduser() / "datasets"

@@ -642,7 +642,7 @@ class World:
             from ..policy import MixturePolicy
 
             policy = MixturePolicy(policy)
-        _check_storable(self.single_action_space)
+        self._world.check_storable()
         policy = self._chosen(policy)
         if writer is None and format is None:
             format = _FORMAT_OF_SUFFIX.get(Path(path or "").suffix)
@@ -933,22 +933,6 @@ def _joined(seeds: Sequence[int]) -> int:
     """One seed for what the seeds of the environments do not state: policies, and the episodes after the first ones."""
     digest = hashlib.sha256(repr(list(seeds)).encode()).digest()
     return int.from_bytes(digest[:4], "little")
-
-
-def _check_storable(space: spaces.Space[Any]) -> None:
-    """Checks that datasets can hold all actions of a space.
-
-    Raises:
-        ValueError: If -1 is an action: in columns of whole numbers it marks that there is none.
-    """
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        start = np.asarray(space.start)
-        count = np.asarray(space.n if isinstance(space, spaces.Discrete) else space.nvec)
-        if np.all((start <= -1) & (start + count > -1)):
-            raise ValueError(
-                f"World.collect: the action space {space} contains -1, which marks a missing action in datasets; wrap the "
-                "environment so that its actions start at 0"
-            )
 
 
 def _reference(policy: Any, actors: dict[int, tuple[Callable[[], Any], Any, Any]]) -> Callable[[], Any]:

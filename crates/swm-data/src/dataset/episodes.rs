@@ -3,7 +3,7 @@
 use crate::dataset::reader::{Episode, StepRange};
 use std::ops::Range;
 use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
-use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
+use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Schema};
 
 /// A row to read, as `(position of its episode, step)`, and the bytes of the output that receive the row.
 pub(crate) type RowSlot<'a> = ((usize, usize), &'a mut [u8]);
@@ -204,6 +204,29 @@ pub(crate) fn check_appendable(dataset: &impl std::fmt::Display, incoming: &Sche
     Err(Error::mismatch(format!("appending to {dataset}"), describe_columns(&incoming), expected))
 }
 
+/// Checks that datasets can hold every action of an environment: none is the value that marks a missing action.
+///
+/// # Errors
+/// If the actions are integers, and -1 in every element is one of them.
+pub fn check_storable(spec: &EnvSpec) -> Result<()> {
+    let space = &spec.action_space;
+    let is_integer = matches!(space.dtype(), DType::Int32 | DType::Int64);
+    let holds = |i| {
+        let (low, high) = space.bounds(i);
+        (low..=high).contains(&-1.0)
+    };
+    if !is_integer || space.is_empty() || !(0..space.len()).all(holds) {
+        return Ok(());
+    }
+    let given =
+        format!("the action space ({}) contains -1, which marks a missing action in datasets", space.describe());
+    Err(Error::config(
+        format!("collecting in {}", spec.id),
+        given,
+        "wrap the environment so that its actions start at 0",
+    ))
+}
+
 /// Checks that an episode has the columns of the writer's schema and follows the time convention: the action of the
 /// last row is missing, all other actions are present and finite.
 ///
@@ -291,4 +314,44 @@ pub(crate) fn content_hash(
         each_row(column, &mut add)?;
     }
     Ok(hasher.finalize().to_hex().to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use swm_core::{Space, VariationSpace};
+
+    #[test]
+    fn actions_of_which_one_is_minus_one_in_every_element_are_refused() {
+        let check = |action_space: Space| {
+            check_storable(&EnvSpec {
+                id: "test/Signed-v0".to_owned(),
+                action_space,
+                columns: vec![],
+                observation_space: vec![],
+                variation_space: VariationSpace::new(vec![], &[]),
+                max_episode_steps: 1,
+                cameras: vec![],
+                angles: vec![],
+            })
+        };
+        for space in [
+            Space::Discrete { n: 3, start: -1 },
+            Space::MultiDiscrete { nvec: vec![3, 4], start: vec![-1, -2] },
+            Space::uniform_box([2], DType::Int32, -2.0, 2.0),
+        ] {
+            let message = check(space).expect_err("-1 is an action").to_string();
+            assert!(message.contains("contains -1, which marks a missing action"), "{message}");
+            assert!(message.contains("test/Signed-v0") && message.contains("start at 0"), "{message}");
+        }
+        for space in [
+            Space::Discrete { n: 3, start: 0 },
+            Space::Discrete { n: 3, start: -4 },
+            Space::MultiDiscrete { nvec: vec![3, 4], start: vec![-1, 0] },
+            Space::uniform_box([2], DType::Float32, -1.0, 1.0),
+            Space::uniform_box([2], DType::U8, 0.0, 255.0),
+        ] {
+            check(space).expect("no action is -1 in every element");
+        }
+    }
 }

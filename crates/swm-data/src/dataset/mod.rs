@@ -22,6 +22,7 @@ mod writer;
 
 pub use cache::CacheConfig;
 pub use clips::{ClipSpec, Clips};
+pub use episodes::check_storable;
 pub use goals::{GoalMixture, GoalSpec};
 pub use loader::{BatchSlice, Epoch, LoadedBatch, Loader, LoaderConfig};
 pub use location::Location;

@@ -1,11 +1,13 @@
 //! The content of collected datasets, and its independence of environments, threads and interruptions.
 
-use crate::line::{ENTRY, Walker};
+use crate::line::{ENTRY, Line, Walker};
 use crate::memory::Memory;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::run::{Control, Event};
-use swm_core::{Batch, DType, EnvEntry, Error, Key, Manifest, Policy, RandomPolicy, Result, VariationRequest};
+use swm_core::{
+    Batch, DType, Env, EnvEntry, Error, Key, Manifest, Policy, RandomPolicy, Result, Space, VariationRequest,
+};
 use swm_eval::continuation::check_continues;
 use swm_eval::{CollectConfig, Collected, MixturePolicy, PolicyChoice, World, WorldConfig};
 
@@ -233,6 +235,26 @@ fn invalid_noise_is_refused_before_a_dataset_is_written() {
     let stored = world(1, 1).collect_manifest(&mixture(2, 0.2));
     let error = check_continues(&stored, &manifest).expect_err("continuing with other noise").to_string();
     assert!(error.contains("action_noise 0.1") && error.contains("0.2"), "{error}");
+}
+
+#[test]
+fn actions_that_mark_a_missing_one_are_refused_before_the_first_step() {
+    let make = || {
+        let mut line = Line::new();
+        line.spec.action_space = Space::Discrete { n: 3, start: -1 };
+        Ok(Box::new(line) as Box<dyn Env>)
+    };
+    let size = WorldConfig { envs: 1, image: None, ..WorldConfig::default() };
+    let mut signed = World::of(make, size.clone()).expect("creating the world");
+    let schema = signed.collect_schema(&config(1)).expect_err("-1 is an action").to_string();
+    assert!(schema.contains("contains -1, which marks a missing action"), "{schema}");
+    let (memory, mut policy) = (Memory::default(), RandomPolicy::new(signed.spec(), 1));
+    let collected = signed.collect(&mut policy, memory.writer(), &config(1), &mut Control::default());
+    assert_eq!(collected.expect_err("-1 is an action").to_string(), schema);
+    for entry in swm_envs::ENVS.rows {
+        let world = World::new(entry, size.clone()).expect("creating the world");
+        world.collect_schema(&config(1)).expect(entry.id);
+    }
 }
 
 /// A policy that fails after `remaining` steps.

@@ -19,7 +19,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
 pub const NEAR: f64 = 0.25;
 
 pub struct Line {
-    spec: EnvSpec,
+    pub spec: EnvSpec,
     factors: FactorValues,
     x: f64,
     goal: f64,

@@ -24,8 +24,8 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Begins to record into a dataset, which is created, or continued if it was recorded in the same environment. `settings` are
-    /// further ones of its manifest.
+    /// Begins to record into a dataset, which is created, or continued if it was recorded in the same environment. One without
+    /// episodes, which an earlier recording left, is replaced. `settings` are further ones of its manifest.
     ///
     /// # Errors
     /// When the name is invalid, or names a dataset that was not recorded in this environment.
@@ -41,12 +41,13 @@ impl Recorder {
             manifest.config[key] = value.clone();
         }
         let location = Location::from(path.clone());
-        if path.exists() && !swm_data::has_no_dataset(&path) {
-            check_own(&location, &manifest)?;
-        }
+        let mode = match path.exists() && !swm_data::has_no_dataset(&path) {
+            true => mode_of(&location, &manifest)?,
+            false => WriteMode::Append,
+        };
         let schema = world.collect_schema(&config)?;
         let options = WriteOptions {
-            mode: WriteMode::Append,
+            mode,
             manifest: Some(manifest),
             commit: CommitPolicy { episodes: 1, ..CommitPolicy::default() },
             exclusive: true,
@@ -171,12 +172,17 @@ impl Recorder {
     }
 }
 
-/// Checks that an existing dataset was recorded in the same environment with the same frames.
-fn check_own(location: &Location, new: &Manifest) -> Result<()> {
+/// Returns how to write to an existing dataset: one that was recorded in the same environment with the same frames is continued,
+/// another recording without episodes is replaced.
+fn mode_of(location: &Location, new: &Manifest) -> Result<WriteMode> {
     swm_data::recover(location)?;
-    let stored = swm_data::open(location.clone())?.manifest();
-    if stored.as_ref().is_some_and(|stored| stored.kind == KIND && stored.config == new.config) {
-        return Ok(());
+    let reader = swm_data::open(location.clone())?;
+    if let Some(stored) = reader.manifest().filter(|stored| stored.kind == KIND) {
+        match (stored.config == new.config, reader.episodes().is_empty()) {
+            (true, _) => return Ok(WriteMode::Append),
+            (false, true) => return Ok(WriteMode::Overwrite),
+            (false, false) => {}
+        }
     }
     let problem = "it exists, and was not recorded in this environment at this frame size";
     Err(Error::config(format!("dataset {location}"), problem, "choose another name"))

@@ -122,6 +122,18 @@ fn kept_episodes_are_stored_when_the_lab_ends() {
     while !matches!(live.receive(), super::Received::Closed) {}
 }
 
+#[test]
+fn the_name_of_a_recording_without_episodes_is_free() {
+    let lab = TestLab::start();
+    for (environment, dataset) in [("swm/TwoRoom-v1", "none"), ("swm/PushT-v1", "none")] {
+        let mut live = lab.live(environment);
+        live.send(&json!({"type": "record", "dataset": dataset}));
+        assert_eq!(live.reply("recording")["dataset"], dataset, "{environment}");
+        drop(live);
+        lab.wait_for_environments(0);
+    }
+}
+
 /// The stored actions, played again from the stored seed, give the stored states.
 fn check_demonstrations(lab: &TestLab) {
     let path = lab.home.path().join("datasets/demos.lance");

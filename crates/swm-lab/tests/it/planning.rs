@@ -1,19 +1,41 @@
-//! A planner of the tests: the simulator, without the program that joins the registries.
+//! Planners of the tests: the simulator, without the program that joins the registries, and one that needs frames.
 
 use swm_core::run::Control;
-use swm_core::{EnvSpec, Error, Predictor, Result};
+use swm_core::{Batch, EnvPool, EnvSpec, Error, Key, Policy, Predictor, Result, columns};
 use swm_data::Reader;
 use swm_eval::World;
 use swm_lab::plans::{FrameDecoder, Model, Planner, Planners, Planning, Position, SIMULATOR, Settings};
 use swm_plan::{ActionKind, ActionScale, MpcPolicy, PlanObserver, SOLVERS, Score, SimulatorCost, pairing};
 
-/// The simulator alone.
+/// The name of the model that needs frames.
+pub const FRAMES: &str = "frames";
+
+/// The simulator, and the simulator as a model that needs frames.
 pub struct Simulated;
+
+/// A policy that needs the column of frames.
+struct NeedsFrames(MpcPolicy);
+
+impl Policy for NeedsFrames {
+    fn begin(&mut self, slot: usize, key: Key) {
+        self.0.begin(slot, key);
+    }
+
+    fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
+        infos.schema().index(columns::PIXELS)?;
+        self.0.act(infos, active, actions)
+    }
+
+    fn observe_envs(&mut self, pool: &EnvPool, active: &[bool]) -> Result<()> {
+        self.0.observe_envs(pool, active)
+    }
+}
 
 impl Planning for Simulated {
     fn models(&self, _: &EnvSpec) -> Vec<Model> {
-        let (name, family) = (SIMULATOR.to_owned(), String::new());
-        vec![Model { name, family, block: None, image: None, history: 1 }]
+        let model =
+            |name: &str, image| Model { name: name.to_owned(), family: String::new(), block: None, image, history: 1 };
+        vec![model(SIMULATOR, None), model(FRAMES, Some(16))]
     }
 
     fn positions(&self, spec: &EnvSpec) -> &'static [Position] {
@@ -42,7 +64,9 @@ impl Planners for Simulated {
         pairing(&settings.solver, &mut cost, ActionKind::of(&spec.action_space))?;
         let solver = (SOLVERS.get(&settings.solver)?.make)(&serde_json::Value::Object(settings.settings.clone()))?;
         let policy = MpcPolicy::new(solver, Box::new(cost), config, scale.clone(), &spec, 1)?.observed(observer);
-        Ok(Planner { policy: Box::new(policy), scale, predictor: None })
+        let policy: Box<dyn Policy> =
+            if model.image.is_some() { Box::new(NeedsFrames(policy)) } else { Box::new(policy) };
+        Ok(Planner { policy, scale, predictor: None })
     }
 
     fn decoder(&mut self, _: (&mut dyn Predictor, usize), _: &dyn Reader, _: &mut Control<'_>) -> Result<FrameDecoder> {

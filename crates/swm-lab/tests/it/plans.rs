@@ -1,5 +1,6 @@
 //! Plan sessions: searches, steps, the tree of steps, its bounds, and what is refused.
 
+use super::planning::FRAMES;
 use super::{Live, Received, TestLab};
 use serde_json::{Value, json};
 use swm_core::Key;
@@ -145,6 +146,22 @@ fn requests_of_plans_that_fail_say_why() {
         for route in ["plan", "planners"] {
             assert_eq!(lab.get(&format!("api/{route}?env={env}")).0, 400, "{route} {env}");
         }
+    }
+}
+
+#[test]
+fn refused_settings_leave_the_planner_in_use() {
+    let lab = TestLab::start();
+    let mut live = planned(&lab);
+    live.send(&settings(json!({"model": FRAMES})));
+    live.reply("ready");
+    live.send(&json!({"type": "decide"}));
+    live.reply("planned");
+    live.send(&settings(json!({"settings": {"samples": 16, "elites": 100}})));
+    assert!(live.reply("failed")["message"].to_string().contains("elites"));
+    for request in [json!({"type": "decide"}), json!({"type": "reset", "seed": 3}), json!({"type": "decide"})] {
+        live.send(&request);
+        live.reply(if request["type"] == "decide" { "planned" } else { "tree" });
     }
 }
 

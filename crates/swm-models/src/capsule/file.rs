@@ -83,6 +83,12 @@ pub(super) fn encode(capsule: &Capsule) -> Result<(Vec<u8>, String)> {
     Ok((safetensors::serialize(views, Some(metadata)).map_err(failed)?, hash))
 }
 
+/// Whether these are the bytes of a capsule, damaged or not.
+pub(super) fn is_capsule(bytes: &[u8]) -> bool {
+    let header = SafeTensors::read_metadata(bytes);
+    header.is_ok_and(|(_, header)| header.metadata().as_ref().is_some_and(|metadata| metadata.contains_key(KEY)))
+}
+
 /// Reads the bytes of the file `path`.
 pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Capsule> {
     let (mut document, mut tensors) = parts(path, bytes)?;

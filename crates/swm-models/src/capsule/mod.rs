@@ -147,6 +147,11 @@ fn rounded(tensor: HostTensor) -> HostTensor {
 }
 
 impl Capsule {
+    /// Whether a file is a capsule, damaged or not.
+    pub fn is_capsule_file(path: &Path) -> bool {
+        files::read(path, MAX_BYTES).is_ok_and(|bytes| file::is_capsule(&bytes))
+    }
+
     /// Reads a capsule and checks its hashes.
     ///
     /// # Errors

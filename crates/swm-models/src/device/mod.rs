@@ -128,6 +128,23 @@ pub fn parse(name: &str) -> Result<Device> {
 /// When the name is not that of a backend, the index is no integer, this build does not contain the backend, there is no such
 /// GPU, or its driver does not pass the test computation.
 pub fn choose(name: &str) -> Result<Choice> {
+    let (choice, precision) = find(name)?;
+    if !is_cpu(&choice.device) {
+        precision.choose()?;
+    }
+    Ok(choice)
+}
+
+/// Checks that [`choose`] finds the device with a name. Unlike it, chooses no precision for the process.
+///
+/// # Errors
+/// As [`choose`], but for another precision than that of the process.
+pub fn check(name: &str) -> Result<()> {
+    find(name).map(drop)
+}
+
+/// Returns the device with a name, and the precision of its matrix products.
+fn find(name: &str) -> Result<(Choice, Precision)> {
     let (device, precision) =
         name.split_once(',').map_or((name, None), |(device, precision)| (device, Some(precision)));
     let precision = match precision {
@@ -140,7 +157,7 @@ pub fn choose(name: &str) -> Result<Choice> {
     let mut choice = choose_device(device)?;
     if is_cpu(&choice.device) {
         if precision == Precision::Single || device == "auto" {
-            return Ok(choice);
+            return Ok((choice, precision));
         }
         let fix = format!("pass --device {device}, or a GPU of `swm devices` such as cuda:0,{precision}");
         return Err(Error::config("--device", format!("'{name}': the CPU computes in single precision"), fix));
@@ -152,11 +169,10 @@ pub fn choose(name: &str) -> Result<Choice> {
         }
         choice.description = format!("{}, {precision}", choice.description);
     }
-    precision.choose()?;
-    Ok(choice)
+    Ok((choice, precision))
 }
 
-/// [`choose`] for a name without precision.
+/// [`find`] for a name without precision.
 fn choose_device(name: &str) -> Result<Choice> {
     if name == "auto" {
         return Ok(automatic());
@@ -358,6 +374,10 @@ mod tests {
         assert!(message("cpu:1").contains("there is one CPU"), "{}", message("cpu:1"));
         assert!(message("cpu,bf16").contains("the CPU computes in single precision"), "{}", message("cpu,bf16"));
         assert!(message("cpu,b16").contains("did you mean bf16"), "{}", message("cpu,b16"));
+        check("cpu,f32").expect("checking 'cpu,f32'");
+        for name in ["cdua", "cpu,bf16"] {
+            assert_eq!(check(name).expect_err("an invalid device is accepted").to_string(), message(name));
+        }
         assert!(is_cpu(&parse("cpu,f32").expect("parsing 'cpu,f32'")));
         if !cfg!(feature = "cuda") {
             assert!(message("cuda:0").contains("without cuda"), "{}", message("cuda:0"));

@@ -1,5 +1,5 @@
-//! [`DinoWmCost`]: the planning cost of a DINO-WM, the mean squared distance between the last predicted patches of a
-//! candidate, or the closest ones, and the patches of the goal image. If the goal of a column is given (`goal_proprio` for `proprio`), the
+//! [`DinoWmCost`]: the planning cost of a DINO-WM, the mean squared distance between the patches of the goal image and the last
+//! predicted patches of a candidate, or the closest ones. If the goal of a column is given (`goal_proprio` for `proprio`), the
 //! mean squared distance between the predicted features and the goal features of the column is added.
 //!
 //! Every environment is evaluated in calls whose shapes do not depend on the other environments, so the
@@ -72,8 +72,8 @@ impl DinoWmCost {
         checks::candidate_sizes("costs of a DINO-WM", candidates, costs, [self.contexts.len(), self.action_dim])
     }
 
-    /// Returns the number of candidates in a rollout call: equal parts of `samples`. It does not depend on the machine, because
-    /// the rounding of products could depend on it.
+    /// Returns the number of candidates in a rollout call: equal parts of `samples`. It depends on no other environment and not on
+    /// the machine, because the rounding of products could depend on it.
     fn chunk_size(&self, samples: usize) -> usize {
         let window = self.config.patches() * self.config.predictor.history;
         let most = (CHUNK_TOKENS / window.max(1)).clamp(CHUNK_SIZES.0, CHUNK_SIZES.1);

@@ -24,8 +24,8 @@ pub struct FamilyEntry {
     pub summary: &'static str,
     /// The configurations that come with the family; the first is the default.
     pub presets: &'static [Preset],
-    /// Whether training uses the encoder of another checkpoint.
-    pub borrows_encoder: bool,
+    /// The family of the checkpoint whose encoder training uses; `None` for a family that trains its own.
+    pub borrows_encoder: Option<&'static str>,
     /// Loads a configuration from a preset (its name or the path of a TOML file) and `key=value` settings.
     pub config: LoadConfig,
     /// Returns the dataset requirements of the default preset; `None` for a family that also requires another
@@ -46,7 +46,7 @@ impl FamilyEntry {
             id: M::FAMILY,
             summary: M::SUMMARY,
             presets: M::PRESETS,
-            borrows_encoder: false,
+            borrows_encoder: None,
             config: |preset, settings| Ok(Box::new(TrainConfig::<M>::load(preset, settings)?)),
             requirements: || Ok(Some(M::requirements(&TrainConfig::<M>::load(M::PRESETS[0].id, &[])?))),
             load: |stored, device| Ok(Box::new(Checkpoint::<M>::of(stored, device)?)),

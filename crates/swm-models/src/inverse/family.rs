@@ -26,7 +26,7 @@ pub const ENTRY: FamilyEntry = FamilyEntry {
         summary: "trains in seconds on two CPU cores, given --encoder",
         toml: InverseConfig::PRESET,
     }],
-    borrows_encoder: true,
+    borrows_encoder: Some(Lewm::FAMILY),
     config: |_, settings| Ok(Box::new(InverseConfig::load(settings)?)),
     requirements: || Ok(None),
     load: |stored, device| Ok(Box::new(InverseCheckpoint::load(stored, device)?)),

@@ -2,7 +2,7 @@
 
 use super::ridge::{Ridge, mean_and_std};
 use super::samples::Spreads;
-use super::state::{Network, scores};
+use super::state::{Network, scores, varying};
 use super::targets::Targets;
 use super::{Score, StateConfig};
 use crate::checks;
@@ -63,10 +63,10 @@ impl StateProbe {
         let map =
             if mean(&scores[1]) > mean(&scores[0]) { Map::Network(Box::new(network)) } else { Map::Linear(linear) };
         let (_, std) = mean_and_std(&y, rows);
-        let spread: Vec<f32> = std
-            .iter()
-            .map(|std| if *std > 0.0 { (*std as f32).max(f32::MIN_POSITIVE) } else { f32::INFINITY })
-            .collect();
+        let varies = varying(&targets.list, &std);
+        let unit =
+            |(std, varies): (&f64, bool)| if varies { (*std as f32).max(f32::MIN_POSITIVE) } else { f32::INFINITY };
+        let spread: Vec<f32> = std.iter().zip(varies).map(unit).collect();
         if spread.iter().all(|spread| spread.is_infinite()) {
             let fix = "name columns that vary, or collect episodes that differ";
             return Err(Error::config("the columns of a probe", "all of them are constant", fix));
@@ -182,12 +182,14 @@ impl Predictor for ProbedLatents {
     }
 }
 
-/// The squared distance between the states that a probe reads from the predicted latent at the end of a plan and from the latent
-/// of the goal. Predictions begin at the latent of one observation.
+/// The squared distance between the states that a probe reads from the predicted latent at the end of a plan, or from the closest
+/// one, and from the latent of the goal. Predictions begin at the latent of one observation.
 pub struct ProbedCost {
     model: Box<dyn Predictor>,
     probe: Arc<StateProbe>,
     scale: ActionScale,
+    /// Whether the closest predicted state is compared, not the last one.
+    closest: bool,
     /// The latents of the observations, and the states of the goals, of all observed environments.
     starts: Vec<f32>,
     goals: Vec<f32>,
@@ -204,7 +206,7 @@ impl ProbedCost {
             let given = format!("{block} actions for a model step");
             return Err(Error::mismatch("planning by a probe", given, format!("{}, as the model", model.frameskip())));
         }
-        Ok(Self { model, probe, scale, starts: vec![], goals: vec![] })
+        Ok(Self { model, probe, scale, closest: false, starts: vec![], goals: vec![] })
     }
 
     /// The latents of the observations, or of the goals, of some environments.
@@ -246,6 +248,7 @@ impl CostModel for ProbedCost {
         checks::candidate_sizes("costs by a probe", &candidates, costs, sizes)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
         let len = horizon * dim;
+        let compared = if self.closest { horizon } else { 1 };
         for (chunk, (actions, costs)) in actions.chunks(CHUNK * len).zip(costs.chunks_mut(CHUNK)).enumerate() {
             let env_of = |i: usize| (chunk * CHUNK + i) / samples;
             let mut of_env = vec![0.0; actions.len()];
@@ -258,15 +261,22 @@ impl CostModel for ProbedCost {
             self.model.rollout(&starts, &of_env, horizon, &mut predicted)?;
             let ends: Vec<f32> = predicted
                 .chunks_exact(horizon * latent)
-                .flat_map(|path| &path[(horizon - 1) * latent..])
+                .flat_map(|path| &path[(horizon - compared) * latent..])
                 .copied()
                 .collect();
-            for (i, (cost, end)) in costs.iter_mut().zip(self.probe.read(&ends).chunks_exact(state)).enumerate() {
+            let states = self.probe.read(&ends);
+            for (i, (cost, ends)) in costs.iter_mut().zip(states.chunks_exact(compared * state)).enumerate() {
                 let goal = &self.goals[env_of(i) * state..][..state];
-                *cost = end.iter().zip(goal).map(|(a, b)| (a - b).powi(2)).sum();
+                let distance = |end: &[f32]| end.iter().zip(goal).map(|(a, b)| (a - b).powi(2)).sum();
+                *cost = ends.chunks_exact(state).map(distance).fold(f32::NAN, f32::min);
             }
         }
         Ok(())
+    }
+
+    fn compare_closest(&mut self) -> bool {
+        self.closest = true;
+        true
     }
 }
 
@@ -332,6 +342,13 @@ mod tests {
         let mut costs = [0.0; 4];
         cost.cost(candidates, &mut costs).expect("costs");
         for (cost, expected) in costs.iter().zip([0.0, 4.0, 4.0, 0.0]) {
+            assert!((cost - expected).abs() < 0.05, "{costs:?}");
+        }
+        assert!(cost.compare_closest());
+        // Half of the way, and back; there and beyond; away from the goal; at the goal, then beyond.
+        let actions = [0.5, -0.5, 1.0, 0.5, 0.5, 0.5, 0.0, 0.5];
+        cost.cost(Candidates { actions: &actions, ..candidates }, &mut costs).expect("costs");
+        for (cost, expected) in costs.iter().zip([1.0, 0.0, 1.0, 0.0]) {
             assert!((cost - expected).abs() < 0.05, "{costs:?}");
         }
         assert!(ProbedCost::new(Box::new(Line), Arc::clone(&probe), scale, 2).is_err());

@@ -12,6 +12,8 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use swm_core::precision::NOISE;
 use swm_core::run::Control;
 use swm_core::{Key, Result};
 use swm_data::{Part, Reader};
@@ -245,6 +247,20 @@ impl Network {
     }
 }
 
+/// The standard deviation, beside the largest one of a column, up to which an element is constant but for rounding.
+const ROUNDING: f64 = 1e-12;
+
+/// Whether each target varies by more than noise, by the standard deviations of all targets.
+pub(super) fn varying(targets: &[Target], spread: &[f64]) -> Vec<bool> {
+    let mut largest: BTreeMap<&str, f64> = BTreeMap::new();
+    for (target, spread) in targets.iter().zip(spread) {
+        let most = largest.entry(&target.column).or_default();
+        *most = most.max(*spread);
+    }
+    let noise = |target: &Target| NOISE.max(ROUNDING * largest[target.column.as_str()]);
+    targets.iter().zip(spread).map(|(target, spread)| *spread > noise(target)).collect()
+}
+
 /// Scores predictions of targets.
 ///
 /// # Shapes
@@ -252,11 +268,12 @@ impl Network {
 pub(super) fn scores(targets: &[Target], predictions: &[f32], values: &[f32]) -> Vec<Score> {
     let (width, count) = (targets.len(), (values.len() / targets.len()) as f64);
     let (_, spread) = mean_and_std(values, values.len() / width);
+    let varies = varying(targets, &spread);
     let score = |(i, Target { column, index, part }): (usize, &Target)| {
         let errors = || predictions.iter().zip(values).skip(i).step_by(width).map(|(a, b)| f64::from(a - b));
         let square = errors().map(|e| e * e).sum::<f64>() / count;
         let (column, index, part, spread) = (column.clone(), *index, *part, spread[i]);
-        let r2 = (spread > 0.0).then(|| 1.0 - square / spread.powi(2));
+        let r2 = varies[i].then(|| 1.0 - square / spread.powi(2));
         let (rmse, mae) = (square.sqrt(), errors().map(f64::abs).sum::<f64>() / count);
         Score { column, index, part, spread, r2, rmse, mae }
     };
@@ -300,6 +317,15 @@ mod tests {
         assert!((score(1.0) - score(1e-12)).abs() < 1e-5);
         // A third has no exact mean in binary.
         assert!(scores(&names, &[1.0; 3], &[1.0 / 3.0; 3])[0].r2.is_none());
+        // Rounding errors beside a position.
+        let names = [0, 1].map(|index| Target { column: "x".to_owned(), index, part: None });
+        let values = [0.0, 1e-17, 3.0, -2e-17, 6.0, 1e-17];
+        let known = |values: &[f32]| -> Vec<bool> {
+            scores(&names, &vec![0.0; values.len()], values).iter().map(|score| score.r2.is_some()).collect()
+        };
+        assert_eq!(known(&values), [true, false]);
+        // A large constant hides no element.
+        assert_eq!(known(&[0.0, 1e30, 3.0, 1e30]), [true, false]);
     }
 
     #[test]

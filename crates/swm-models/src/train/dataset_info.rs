@@ -8,6 +8,9 @@ use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Schema, Space, 
 use swm_data::{Reader, column_stats};
 use swm_plan::ActionScale;
 
+/// The standard deviation, beside the magnitude of the values, up to which they are constant but for noise.
+const RELATIVE_NOISE: f64 = 1e-3;
+
 /// The statistics of the dataset a model was trained on; stored in its checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DatasetInfo {
@@ -65,6 +68,24 @@ impl ColumnInfo {
             return Err(Error::config(format!("column '{ACTION}' of the training data"), given, fix));
         }
         Ok(Self { shape: spec.shape.clone(), mean: stats.mean, std: stats.std, min: stats.min, max: stats.max })
+    }
+
+    /// Checks that a column is not treated as constant although it varies: no element has a larger standard deviation than
+    /// [`precision::CONSTANT`], and one has more than rounding gives.
+    fn check_scale(&self, name: &str) -> Result<()> {
+        let is_noise =
+            |&element: &usize| self.std[element] <= precision::NOISE.max(RELATIVE_NOISE * self.magnitude(element));
+        let varies = (0..self.dim()).find(|element| !is_noise(element));
+        let Some(element) = varies.filter(|_| self.std.iter().all(|&std| std <= precision::CONSTANT)) else {
+            return Ok(());
+        };
+        let given = format!("has a standard deviation of {:.1e} in element {element}", self.std[element]);
+        let fix = format!(
+            "values below {:.0e} are treated as constant: multiply {} by a scale when you collect",
+            precision::CONSTANT,
+            if name == ACTION { "the actions" } else { "the column" }
+        );
+        Err(Error::config(format!("column '{name}' of the training data"), given, fix))
     }
 
     /// The largest magnitude of an element.
@@ -133,6 +154,24 @@ impl DatasetInfo {
     /// # Errors
     /// When there is no column of continuous actions, a column is missing, or the data are damaged.
     pub fn from_reader(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
+        Self::checked(reader, columns, bounded, |_, _| Ok(()))
+    }
+
+    /// As [`DatasetInfo::from_reader`], for a training on the columns.
+    ///
+    /// # Errors
+    /// As there, and when a column would be treated as constant although it varies.
+    pub fn for_training(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
+        Self::checked(reader, columns, bounded, |name, column| column.check_scale(name))
+    }
+
+    /// Computes the statistics, and checks each column but those whose range is scaled.
+    fn checked(
+        reader: &dyn Reader,
+        columns: &[String],
+        bounded: bool,
+        check: impl Fn(&str, &ColumnInfo) -> Result<()>,
+    ) -> Result<Self> {
         let schema = reader.schema();
         let action = schema.column(ACTION)?;
         if action.dtype != DType::Float32 {
@@ -147,8 +186,14 @@ impl DatasetInfo {
         for name in columns.iter().filter(|name| *name != ACTION) {
             let spec = schema.column(name)?;
             if spec.dtype != DType::U8 {
-                observed.insert(name.clone(), ColumnInfo::of(reader, spec)?);
+                let column = ColumnInfo::of(reader, spec)?;
+                check(name, &column)?;
+                observed.insert(name.clone(), column);
             }
+        }
+        // A range is mapped to -1 ..= 1 whatever its size.
+        if !bounded {
+            check(ACTION, &action)?;
         }
         let env = reader.manifest().and_then(|manifest| Some(manifest.config.get("env")?.as_str()?.to_owned()));
         let action = if bounded { range_scale(&action) } else { standard_scale(&action) };

@@ -118,7 +118,7 @@ impl Inputs {
         let loader = M::loader_config(config, reader.schema())?;
         let goals = loader.goals.iter().flat_map(|goal| &goal.columns);
         let columns: Vec<String> = loader.clip.columns.iter().chain(goals).cloned().collect();
-        let dataset_info = DatasetInfo::from_reader(reader, &columns, M::BOUNDED_ACTIONS)?;
+        let dataset_info = DatasetInfo::for_training(reader, &columns, M::BOUNDED_ACTIONS)?;
         dataset_info.check_precision(reader.schema(), &columns)?;
         let manifest = learner::manifest(config, reader.content_hash()?, &options.device);
         Ok(Self { loader, dataset_info, manifest })

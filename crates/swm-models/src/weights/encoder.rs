@@ -1,6 +1,7 @@
 //! [`fill`]: the weights of an encoder from a file of an encoder, or of a model with one.
 
 use super::{locate, names, read};
+use crate::capsule::Capsule;
 use crate::nn::parameters::{self, HostTensor, Named};
 use crate::nn::{Backbone, BackboneConfig, KeypointsConfig};
 use crate::pixels::ImageNormalization;
@@ -12,13 +13,13 @@ use std::path::Path;
 use swm_core::{Error, Result};
 
 /// The names under which models hold their encoder, after that of an encoder alone.
-const PREFIXES: [&str; 3] = ["", "encoder.", "model.encoder."];
+const PREFIXES: [&str; 4] = ["", "encoder.", "model.encoder.", "backbone."];
 
 /// Replaces the weights of an encoder with this configuration by those in the file or repository `from`; without `from`, returns
 /// the encoder as it is.
 ///
 /// # Errors
-/// When the file cannot be read, holds no encoder of this size, or is that of a model here with another part that is not trained
+/// When the file cannot be read, holds no encoder of this size, is part of a damaged checkpoint or capsule, or is that of a model here with another part that is not trained
 /// (filters, colours) or other images.
 pub(crate) fn fill(
     encoder: Backbone,
@@ -30,10 +31,17 @@ pub(crate) fn fill(
         return Ok(encoder);
     }
     let path = locate(from, cache)?;
-    if let Some(model) = model_of(&path) {
-        check_same_inputs(&model, config, images, &path)?;
-    }
-    let found = names::to_published(read(&path)?, "", &path)?;
+    let found = match stored(&path)? {
+        Some(stored) => {
+            stored.check_config()?;
+            if let Some(model) = stored.content().get("config").and_then(|config| config.get("model")) {
+                check_same_inputs(model, config, images, &path)?;
+            }
+            stored.weights()?
+        }
+        None => read(&path)?,
+    };
+    let found = names::to_published(found, "", &path)?;
     let shapes = parameters::shapes(&encoder);
     let count = |prefix: &&&str| shapes.keys().filter(|name| found.contains_key(&format!("{prefix}{name}"))).count();
     // The first of those that hold the most weights.
@@ -43,11 +51,14 @@ pub(crate) fn fill(
     super::fill(encoder, &found, &path, "model.encoder")
 }
 
-/// Returns the configuration of the model here whose weights are in this file, of a checkpoint folder or a capsule.
-fn model_of(path: &Path) -> Option<Value> {
-    let is_in_folder = path.file_name().is_some_and(|name| name == run_folder::WEIGHTS);
-    let stored = StoredCheckpoint::read(if is_in_folder { path.parent()? } else { path }).ok()?;
-    Some(stored.content().get("config")?.get("model")?.clone())
+/// Returns the checkpoint whose weights are in this file: that of its folder, or a capsule; `None` for other files.
+fn stored(path: &Path) -> Result<Option<StoredCheckpoint>> {
+    let folder = path.parent().filter(|_| path.file_name().is_some_and(|name| name == run_folder::WEIGHTS));
+    match folder.filter(|folder| folder.join(run_folder::MANIFEST).exists()) {
+        Some(folder) => StoredCheckpoint::read(folder).map(Some),
+        None if Capsule::is_capsule_file(path) => StoredCheckpoint::read(path).map(Some),
+        None => Ok(None),
+    }
 }
 
 /// Checks that a model computes the inputs of its trained layers as this configuration does.

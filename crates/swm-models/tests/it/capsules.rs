@@ -176,6 +176,10 @@ fn damaged_capsules_are_refused() {
         let Ok(read) = catch_unwind(|| Capsule::read(&path).map(drop)) else { panic!("byte {place} panics") };
         assert!(read.is_err(), "byte {place} is changed, and the capsule is read");
     }
+    let mut changed = bytes.clone();
+    changed[bytes.len() - 1] ^= 1;
+    fs::write(&path, changed).expect("a written file");
+    assert!(Capsule::is_capsule_file(&path), "a damaged capsule counts as a file of weights");
     for length in [0, 7, 8, 100, bytes.len() / 2, bytes.len() - 1] {
         fs::write(&path, &bytes[..length]).expect("a written file");
         assert!(Capsule::read(&path).is_err(), "{length} bytes");
@@ -207,6 +211,7 @@ fn other_files_are_no_capsules() {
     let run = folder.path().join("run");
     model::<Lewm>(&[SMALL, SMALL_PREDICTOR]).save_to(&run).expect("a checkpoint");
     let weights = error(&run.join("checkpoint/weights.safetensors"));
+    assert!(!Capsule::is_capsule_file(&run.join("checkpoint/weights.safetensors")));
     assert!(weights.contains("is no capsule") && weights.contains("checkpoints pack"), "{weights}");
     assert!(error(&run.join("checkpoint/config.json")).contains("is no capsule"));
     assert!(error(Path::new("/dev/zero")).contains("not a regular file"));

@@ -77,7 +77,7 @@ fn every_setting_can_be_given_alone() {
 
 #[test]
 fn validation_needs_no_other_setting_of_its_table() {
-    for family in FAMILIES.rows.iter().filter(|family| !family.borrows_encoder) {
+    for family in FAMILIES.rows.iter().filter(|family| family.borrows_encoder.is_none()) {
         for setting in ["validation.every=10", "validation.batches=2"] {
             let settings = [setting.to_owned(), "data.hold_out=true".to_owned()];
             if let Err(error) = (family.config)(family.presets[0].id, &settings) {

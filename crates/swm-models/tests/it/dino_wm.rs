@@ -97,6 +97,28 @@ fn the_encoder_of_another_model_is_used_and_frames_are_encoded_once() {
         for (name, value) in frozen {
             assert_eq!(found[&format!("{prefix}{name}")], value, "{name}");
         }
+        // The encoder of a DINO-WM is one as well; a damaged file of a checkpoint is none.
+        let (nested, damaged) = (from.join("nested"), from.join("damaged"));
+        config.model.weights = out.join("checkpoint/weights.safetensors").display().to_string();
+        run(&config, &nested, 1).expect("training on the encoder of a DINO-WM");
+        let bytes = std::fs::read(&file).expect("reading the weights");
+        let mut changed = bytes.clone();
+        changed[bytes.len() - 3] ^= 1;
+        std::fs::write(&file, changed).expect("damaging the weights");
+        config.model.weights = file.display().to_string();
+        let error = run(&config, &damaged, 1).expect_err("damaged weights").to_string();
+        assert!(error.contains("hash"), "{error}");
+        std::fs::write(&file, bytes).expect("restoring the weights");
+        let text = file.with_file_name("config.json");
+        let stored = std::fs::read(&text).expect("reading the configuration");
+        std::fs::write(&text, "{").expect("damaging the configuration");
+        let error = run(&config, &damaged, 1).expect_err("a damaged configuration").to_string();
+        assert!(error.contains("config.json"), "{error}");
+        let changed = String::from_utf8(stored.clone()).expect("a text").replacen("\"seed\": ", "\"seed\": 1", 1);
+        std::fs::write(&text, changed).expect("changing the configuration");
+        let error = run(&config, &damaged, 1).expect_err("a changed configuration").to_string();
+        assert!(error.contains("config.json"), "{error}");
+        std::fs::write(&text, stored).expect("restoring the configuration");
         // The trained layers read other features than those they were trained with.
         let BackboneConfig::Keypoints(keypoints) = &mut config.model.encoder else {
             unreachable!("an encoder of keypoints")

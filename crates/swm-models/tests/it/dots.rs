@@ -61,6 +61,27 @@ impl Dots {
         Self { readable: frames, ..self }
     }
 
+    /// Multiplies the values of column 1 (`action`) or 2 (`position`).
+    pub fn scaled(self, column: usize, factor: f32) -> Self {
+        self.scaled_by(column, [factor; 2])
+    }
+
+    /// Multiplies the elements of column 1 or 2 by factors of their own.
+    pub fn scaled_by(mut self, column: usize, factors: [f32; 2]) -> Self {
+        for row in 0..self.episodes.len() * LENGTH {
+            self.rows.row_mut(row).at::<f32>(column).iter_mut().zip(factors).for_each(|(value, by)| *value *= by);
+        }
+        self
+    }
+
+    /// Adds offsets to the elements of column 1 or 2.
+    pub fn shifted(mut self, column: usize, offsets: [f32; 2]) -> Self {
+        for row in 0..self.episodes.len() * LENGTH {
+            self.rows.row_mut(row).at::<f32>(column).iter_mut().zip(offsets).for_each(|(value, by)| *value += by);
+        }
+        self
+    }
+
     /// Sets the first action of an episode.
     pub fn with_action(mut self, episode: usize, action: [f32; 2]) -> Self {
         self.rows.row_mut(episode * LENGTH).set(1, &action);

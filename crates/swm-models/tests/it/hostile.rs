@@ -386,6 +386,24 @@ fn infinite_and_missing_actions_are_refused_before_training() {
     }
 }
 
+#[test]
+fn columns_that_vary_too_little_for_a_model_are_refused() {
+    let columns = ["position".to_owned()];
+    let info = |dots: &crate::dots::Dots, bounded| DatasetInfo::for_training(dots, &columns, bounded);
+    for (column, name) in [(1, "action"), (2, "position")] {
+        let dots = crate::dots::Dots::new(2, 0).scaled(column, 1e-8);
+        let error = info(&dots, false).expect_err(name).to_string();
+        assert!(error.contains(&format!("column '{name}' of the training data")) && error.contains("scale"), "{error}");
+    }
+    // Rounding errors of zero and of one are noise, and so is an element beside one that varies more.
+    info(&crate::dots::Dots::new(2, 0).scaled(2, 1e-16), false).expect("zeros");
+    info(&crate::dots::Dots::new(2, 0).scaled(2, 1e-7).shifted(2, [1.0, 1.0]), false).expect("ones");
+    info(&crate::dots::Dots::new(2, 0).scaled_by(1, [1.0, 1e-8]), false).expect("one element that varies");
+    // A range of actions is mapped to -1 ..= 1, and a constant is one in any unit.
+    info(&crate::dots::Dots::new(2, 0).scaled(1, 1e-8), true).expect("a small range of actions");
+    info(&crate::dots::Dots::new(2, 0).scaled(2, 0.0), false).expect("a constant column");
+}
+
 /// A PyTorch file with one negative tensor of the values [1.0, 2.0], in the pickle that `torch.save` writes.
 fn negative(path: &Path) {
     let text = |text: &str| [b"X".as_slice(), &(text.len() as u32).to_le_bytes(), text.as_bytes()].concat();

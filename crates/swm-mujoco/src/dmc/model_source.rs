@@ -1,6 +1,7 @@
 //! [`ModelSource`]: the MJCF text of a model of the suite, compiled with factors of variation.
 
 use super::model_edit::ModelEdit;
+use crate::physics::compile_spec;
 use crate::{assets, link};
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::{MjModel, MjSpec};
@@ -48,7 +49,7 @@ impl ModelSource {
         vfs.add_from_buffer(self.name, self.text.as_bytes()).map_err(|error| failed(&error))?;
         let mut spec = MjSpec::from_xml_vfs(self.name, &vfs).map_err(|error| failed(&error))?;
         edit(&mut ModelEdit::new(&mut spec, factors))?;
-        spec.compile().map_err(|error| failed(&error))
+        compile_spec(&mut spec).map_err(|error| failed(&error))
     }
 }
 

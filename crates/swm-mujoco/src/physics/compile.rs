@@ -1,11 +1,13 @@
 //! Compiling models, sharing them between environments, and finding their named elements.
-#![allow(unsafe_code, reason = "mutable access to a model's equality constraints")]
+#![allow(unsafe_code, reason = "the locale of a thread; mutable access to a model's equality constraints")]
 
 use crate::link;
+use libc::{LC_NUMERIC_MASK, freelocale, locale_t, newlocale, uselocale};
+use mujoco_rs::error::MjEditError;
 use mujoco_rs::mujoco_c::{mjNEQDATA, mjtEq};
-use mujoco_rs::wrappers::MjModel;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::mj_model::MjtObjBase;
+use mujoco_rs::wrappers::{MjModel, MjSpec};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -34,6 +36,51 @@ pub fn compile_xml(label: &str, xml: &str, files: &[(&str, &[u8])]) -> Result<Mj
     }
     vfs.add_from_buffer("model.xml", xml.as_bytes()).map_err(|error| failed(&error))?;
     MjModel::from_xml_vfs("model.xml", &vfs).map_err(|error| failed(&error))
+}
+
+/// Compiles a description whose meshes may be texts: their numbers have a decimal point, whatever the locale of the process.
+///
+/// # Errors
+/// When MuJoCo rejects the description (the error contains its message).
+pub fn compile_spec(spec: &mut MjSpec) -> Result<MjModel, MjEditError> {
+    // Threads that MuJoCo starts would have the locale of the process.
+    spec.compiler_mut().set_usethread(false);
+    let _numbers = CLocale::enter();
+    spec.compile()
+}
+
+/// The C locale, in this thread until it is dropped.
+struct CLocale {
+    before: locale_t,
+    own: locale_t,
+}
+
+impl CLocale {
+    /// Enters the locale; `None` without memory for it.
+    fn enter() -> Option<Self> {
+        // SAFETY: the name ends with a zero, and without a base a new locale is made, the C locale in every category.
+        let own = unsafe { newlocale(LC_NUMERIC_MASK, c"C".as_ptr(), std::ptr::null_mut()) };
+        if own.is_null() {
+            return None;
+        }
+        // SAFETY: the locale is valid; it is freed only after this thread has left it, or here if it was not entered.
+        let before = unsafe { uselocale(own) };
+        if before.is_null() {
+            // SAFETY: no thread uses the locale, which was made above.
+            unsafe { freelocale(own) };
+            return None;
+        }
+        Some(Self { before, own })
+    }
+}
+
+impl Drop for CLocale {
+    fn drop(&mut self) {
+        // SAFETY: the thread had the earlier locale, which MuJoCo does not free.
+        unsafe { uselocale(self.before) };
+        // SAFETY: `enter` made this locale, and no thread uses it any more.
+        unsafe { freelocale(self.own) };
+    }
 }
 
 /// Returns the model with this name; the first call in this process compiles it.

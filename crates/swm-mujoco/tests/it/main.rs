@@ -5,6 +5,7 @@ mod allocation;
 mod conformance;
 mod golden;
 mod link;
+mod locale;
 mod no_gl;
 mod play;
 mod readout;

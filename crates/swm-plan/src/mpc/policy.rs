@@ -84,7 +84,8 @@ impl MpcPolicy {
     /// for a model that uses the environment's own units).
     ///
     /// # Errors
-    /// When the settings contradict each other, or the environment's actions cannot be planned or do not fit `scale`.
+    /// When the settings contradict each other, or the environment's actions cannot be planned or do not fit `scale` or the
+    /// solver's settings.
     pub fn new(
         solver: Box<dyn Solver>,
         cost: Box<dyn CostModel>,
@@ -95,6 +96,7 @@ impl MpcPolicy {
     ) -> Result<Self> {
         config.check()?;
         let codec = ActionCodec::new(spec, scale, config.action_block)?;
+        solver.check_space(codec.space())?;
         let (dim, width) = (codec.space().dim(), codec.width());
         let slot = Slot {
             key: Key::new(0),

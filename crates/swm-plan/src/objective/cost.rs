@@ -78,7 +78,8 @@ impl ObjectiveCost {
 }
 
 fn dynamics(model: &mut dyn CostModel) -> Result<&mut dyn LatentDynamics> {
-    let fix = "plan with the model's own cost, or with a model that has latent dynamics";
+    let fix = "plan with the model's own cost, or with a model that has latent dynamics; of the terms, goal,when=closest alone, \
+               without a weight, is a cost that some models have";
     model.latent().ok_or_else(|| Error::config("objective", "it uses latents, and this model has none", fix))
 }
 

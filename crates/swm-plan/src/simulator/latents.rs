@@ -5,21 +5,24 @@ use crate::mpc::ActionScale;
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Env, Error, FrameMut, Predictor, Result, Schema};
 
-/// The squared distance between the latent of the observation in which a simulated candidate ends and the latent of the
-/// goal. The candidate is played in the environment, and a world model encodes what it leads to: its dynamics are not used.
+/// The squared distance between the latent of the observation in which a simulated candidate ends, or of the closest one after a
+/// model step, and the latent of the goal. The candidate is played in the environment, and a world model encodes what it leads to:
+/// its dynamics are not used. For the closest latent, a candidate is played once for every step, from its start.
 pub struct SimulatedLatents {
     playback: Playback,
     model: Box<dyn Predictor>,
     /// The number of the environment's own columns, which are the first of the infos.
     own: usize,
-    /// The observations in which candidates end: the environment's columns, and frames if the model reads them.
+    /// Whether the closest latent is compared, not the last one.
+    closest: bool,
+    /// The compared observations of candidates: the environment's columns, and frames if the model reads them.
     ends: Option<Batch>,
     /// The latents of the goals of the observed environments, `[envs, latent]`.
     goals: Vec<f32>,
     latents: Vec<f32>,
 }
 
-/// The number of candidates whose observations are held at once.
+/// The number of observations that are held at once.
 const CHUNK: usize = 1024;
 
 impl SimulatedLatents {
@@ -36,7 +39,7 @@ impl SimulatedLatents {
     ) -> Result<Self> {
         let playback = Playback::new(Box::new(make), scale, action_block)?;
         let own = playback.with(|simulator| Ok(simulator.env.spec().columns.len()))?;
-        Ok(Self { playback, model, own, ends: None, goals: vec![], latents: vec![] })
+        Ok(Self { playback, model, own, closest: false, ends: None, goals: vec![], latents: vec![] })
     }
 
     /// The columns of the observations: the environment's own, and the frame if the model reads it.
@@ -92,17 +95,22 @@ impl CostModel for SimulatedLatents {
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.playback.check(&candidates)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
+        let compared = if self.closest { horizon } else { 1 };
         let Self { playback, model, ends: Some(ends), goals, latents, .. } = self else { return Ok(()) };
         let (len, latent) = (horizon * dim, model.latent_dim());
         let frame = ends.schema().find(PIXELS).map(|index| (index, ends.schema().columns()[index].shape.clone()));
-        let chunks = actions.chunks(CHUNK * len).zip(costs.chunks_mut(CHUNK));
+        let in_chunk = CHUNK.div_ceil(compared);
+        let chunks = actions.chunks(in_chunk * len).zip(costs.chunks_mut(in_chunk));
         for (chunk, (actions, costs)) in chunks.enumerate() {
-            ends.resize(costs.len());
-            let mut failed: Vec<Option<Error>> = Vec::from_iter(costs.iter().map(|_| None));
-            ends.par_zip_mut(&mut failed, |i, mut row, failed| {
+            let rows = costs.len() * compared;
+            ends.resize(rows);
+            let mut failed: Vec<Option<Error>> = Vec::from_iter((0..rows).map(|_| None));
+            ends.par_zip_mut(&mut failed, |row_index, mut row, failed| {
+                // A row plays its candidate up to its own step.
+                let (i, steps) = (row_index / compared, horizon - compared + 1 + row_index % compared);
                 let played = playback.with(|simulator| {
-                    simulator.env.restore(playback.start((chunk * CHUNK + i) / samples))?;
-                    for planned in actions[i * len..][..len].chunks_exact(playback.width()) {
+                    simulator.env.restore(playback.start((chunk * in_chunk + i) / samples))?;
+                    for planned in actions[i * len..][..steps * dim].chunks_exact(playback.width()) {
                         playback.step(simulator, planned)?;
                     }
                     simulator.env.observe(&mut row);
@@ -118,13 +126,19 @@ impl CostModel for SimulatedLatents {
             if let Some(error) = failed.into_iter().flatten().next() {
                 return Err(error);
             }
-            latents.resize(costs.len() * latent, 0.0);
+            latents.resize(rows * latent, 0.0);
             model.encode(ends, latents)?;
-            for (i, (cost, end)) in costs.iter_mut().zip(latents.chunks_exact(latent)).enumerate() {
-                let goal = &goals[(chunk * CHUNK + i) / samples * latent..][..latent];
-                *cost = end.iter().zip(goal).map(|(a, b)| (a - b).powi(2)).sum();
+            for (i, (cost, ends)) in costs.iter_mut().zip(latents.chunks_exact(compared * latent)).enumerate() {
+                let goal = &goals[(chunk * in_chunk + i) / samples * latent..][..latent];
+                let distance = |end: &[f32]| end.iter().zip(goal).map(|(a, b)| (a - b).powi(2)).sum();
+                *cost = ends.chunks_exact(latent).map(distance).fold(f32::NAN, f32::min);
             }
         }
         Ok(())
+    }
+
+    fn compare_closest(&mut self) -> bool {
+        self.closest = true;
+        true
     }
 }

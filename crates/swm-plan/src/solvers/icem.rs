@@ -24,9 +24,13 @@ use crate::entry::{ActionKind, Family, SolverEntry, defaults, make};
 use crate::search::{ColouredNoise, Gaussian, Population, Settings, average, continuous, iterate};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use swm_core::{CostModel, Plan, PlanProblem, Result, Solver};
+use swm_core::{CostModel, Plan, PlanProblem, PlanSpace, Result, Solver};
 
 const ID: &str = "icem";
+
+/// The largest exponent of the noise's spectrum. The noise hardly changes above it, and the weights of long plans would become
+/// infinite.
+const MAX_BETA: f32 = 10.0;
 
 /// The row of this solver in the registry.
 pub const ENTRY: SolverEntry = SolverEntry {
@@ -52,7 +56,7 @@ pub struct ICem {
     pub elites: usize,
     /// The initial standard deviation, σ₀, in model action units.
     pub sigma: f32,
-    /// The exponent of the noise's spectrum, β: 0 is white, 1 pink, 2 red.
+    /// The exponent of the noise's spectrum, β, at most 10: 0 is white, 1 pink, 2 red.
     pub beta: f32,
     /// The number of actions in a model step, the action block, from one to the next of which the noise is coloured; 1
     /// draws the actions of a step independently, as the reference does.
@@ -73,10 +77,7 @@ impl Solver for ICem {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
         self.check()?;
         let bounds = continuous(&ENTRY, cost, &problem)?;
-        let dim = problem.space.dim();
-        let block = format!("{} for {dim} dimensions of a model step", self.block);
-        let fix = "give the action block of the model, or 1";
-        Settings(ID).check(dim.is_multiple_of(self.block), "block", block, fix)?;
+        self.check_space(problem.space)?;
         // `[horizon, block * action]` is `[horizon * block, action]`.
         let colour = ColouredNoise::new(self.beta, problem.horizon * self.block);
         let mut gaussians = Gaussian::initial(&problem, bounds, self.sigma);
@@ -106,7 +107,8 @@ impl Solver for ICem {
         settings.samples(self.samples)?;
         settings.elites(self.elites, 2, self.samples)?;
         settings.positive("sigma", self.sigma)?;
-        settings.not_negative("beta", self.beta)?;
+        let fix = format!("choose a number of 0 to {MAX_BETA}: 0 is white noise, 1 pink, 2 red");
+        settings.check((0.0..=MAX_BETA).contains(&self.beta), "beta", self.beta, &fix)?;
         settings.at_least_one("block", self.block)?;
         settings.momentum("momentum", self.momentum)?;
         // The first candidate is always the mean, so at most `samples - 1` elites can be kept.
@@ -116,6 +118,13 @@ impl Solver for ICem {
             self.elites.min(self.samples - 1),
             "elites and of candidates after the mean",
         )
+    }
+
+    fn check_space(&self, space: PlanSpace<'_>) -> Result<()> {
+        let dim = space.dim();
+        let block = format!("{} for {dim} dimensions of a model step", self.block);
+        let fix = "give the action block of the model, or 1";
+        Settings(ID).check(dim.is_multiple_of(self.block), "block", block, fix)
     }
 }
 

@@ -6,7 +6,7 @@ use swm_core::{
     Batch, Candidates, ColumnSpec, CostModel, DType, EnvSpec, Key, Plan, PlanProblem, PlanSpace, PlanTrace, Policy,
     Result, Schema, Solver, Space, VariationSpace,
 };
-use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy, TraceLog};
+use swm_plan::{ActionScale, Cem, ICem, MpcConfig, MpcPolicy, TraceLog};
 
 /// One call of the solver: the keys and the initial guess.
 type Call = (Vec<Key>, Vec<f32>);
@@ -282,6 +282,18 @@ fn latency_budget_sets_the_deadline() {
     assert!(end >= before + budget && end <= Instant::now() + budget);
     assert_eq!(deadline(Some(1e30)), None, "beyond the range of the clock");
     assert_eq!(deadline(None), None);
+}
+
+#[test]
+fn settings_that_do_not_fit_the_actions_are_refused_before_the_first_plan() {
+    let make = |block| {
+        let solver = Box::new(ICem { block, ..ICem::default() });
+        let config = MpcConfig { action_block: 5, ..MpcConfig::default() };
+        MpcPolicy::new(solver, Box::<RecordingModel>::default(), config, ActionScale::identity(1), &spec(1.0), 1)
+    };
+    assert!(make(5).is_ok());
+    let message = make(99).err().expect("99 does not divide 5").to_string();
+    assert!(message.contains("icem block: 99 for 5 dimensions of a model step"), "{message}");
 }
 
 #[test]

@@ -135,6 +135,7 @@ fn errors_name_invalid_settings() {
         ("icem", json!({"momentum": 1.5}), "icem momentum: 1.5; choose a number of at least 0 and below 1"),
         ("icem", json!({"momentum": -0.1}), "icem momentum"),
         ("icem", json!({"beta": -1}), "icem beta"),
+        ("icem", json!({"beta": 1000}), "icem beta: 1000; choose a number of 0 to 10"),
         ("icem", json!({"block": 0}), "icem block: 0; choose at least 1"),
         ("icem", json!({"block": 5}), "icem block: 5 for 2 dimensions of a model step; give the action block"),
         ("icem", json!({"keep": 31}), "icem keep: 31; choose at most 30"),

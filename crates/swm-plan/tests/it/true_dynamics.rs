@@ -121,6 +121,30 @@ fn costs_are_distances_of_the_latents_that_candidates_lead_to() {
 }
 
 #[test]
+fn closest_latent_is_the_last_one_of_the_cheapest_shorter_plan() {
+    let (pool, mut rng) = (pool(2), Key::new(3).rng());
+    let (samples, dim) = (600, BLOCK * 2);
+    let all: Vec<f32> = (0..2 * samples * HORIZON * dim).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let cost = |horizon: usize, closest: bool| {
+        let mut model = model(&pool, &[0, 1], "state");
+        assert!(!closest || model.compare_closest());
+        let actions: Vec<f32> =
+            all.chunks_exact(HORIZON * dim).flat_map(|candidate| &candidate[..horizon * dim]).copied().collect();
+        let mut costs = vec![f32::NAN; 2 * samples];
+        let candidates = Candidates { actions: &actions, envs: 2, samples, horizon, dim };
+        model.cost(candidates, &mut costs).expect("the model computes costs");
+        costs
+    };
+    let shorter: Vec<Vec<f32>> = (1..=HORIZON).map(|horizon| cost(horizon, false)).collect();
+    let least = |i: usize| shorter.iter().map(|costs| costs[i]).fold(f32::INFINITY, f32::min);
+    assert_eq!(cost(HORIZON, true), (0..2 * samples).map(least).collect::<Vec<_>>());
+    assert!(
+        shorter.iter().all(|costs| (0..2 * samples).any(|i| costs[i] > least(i))),
+        "one step is always the closest"
+    );
+}
+
+#[test]
 fn costs_do_not_depend_on_other_environments_threads_or_chunks() {
     let (pool, mut rng) = (pool(3), Key::new(2).rng());
     // More candidates than are held at once.

@@ -225,6 +225,23 @@ pub fn check(args: &CollectArgs) -> Result<Schema> {
     world.collect_schema(&collection.config)
 }
 
+/// Returns the manifest of the dataset that a command line collects. If a policy cannot be loaded, the manifest has no hashes
+/// of weights, and the error is returned beside it. Writes nothing.
+///
+/// # Errors
+/// As [`check`], but for the policies.
+pub fn manifest(args: &CollectArgs) -> Result<(Manifest, Option<Error>)> {
+    let location = home::target(&args.output, args.format.as_deref())?;
+    let mut collection = Collection::of(args, &location, 1)?;
+    collection.world.envs = 1;
+    let world = collection.make_world()?;
+    let (weights, problem) = match policy_of_choice(&collection.env.entry, &collection.config.policy, &world) {
+        Ok((_, weights)) => (weights, None),
+        Err(error) => (BTreeMap::new(), Some(error)),
+    };
+    Ok((collection.manifest(&world, weights)?, problem))
+}
+
 /// Collects, and shows progress.
 pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
     let Collection { location, config, .. } = collection;
@@ -269,14 +286,20 @@ type Prepared = (World, Box<dyn Policy>, BTreeMap<String, String>);
 impl Collection<'_> {
     /// Checks the settings, and returns the world, the policy and the hashes of the policies' weights.
     fn prepare(&self) -> Result<Prepared> {
+        let world = self.make_world()?;
+        let (policy, weights) = policy_of_choice(&self.env.entry, &self.config.policy, &world)?;
+        Ok((world, policy, weights))
+    }
+
+    /// Checks the settings but the policies, and returns the world.
+    fn make_world(&self) -> Result<World> {
         let Collection { env, config, .. } = self;
         limits::EPISODES.check(config.episodes)?;
         limits::SHARDS.check(self.shard.map_or(0, |shard| shard.count))?;
         let (stack, goal) = self.wrappers.stack()?;
         let world = World::of(|| Ok(stack.wrap(env.env()?, goal)), self.world.clone())?;
-        let (policy, weights) = policy_of_choice(&env.entry, &config.policy, &world)?;
         world.spec().variation_space.resolve(&config.variation, Key::new(config.seed))?;
-        Ok((world, policy, weights))
+        Ok(world)
     }
 
     /// Returns the manifest of the dataset; `hashes` are those of the policies' weights.

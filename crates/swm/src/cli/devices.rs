@@ -34,6 +34,14 @@ pub fn devices(as_json: bool) -> anyhow::Result<()> {
 }
 
 impl DeviceArgs {
+    /// Checks that the device can be opened.
+    ///
+    /// # Errors
+    /// As [`device::check`].
+    pub fn check(&self) -> Result<()> {
+        device::check(&self.device)
+    }
+
     /// Opens the device, and says which it is unless it is the CPU that was asked for.
     ///
     /// # Errors

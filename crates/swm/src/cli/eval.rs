@@ -367,7 +367,7 @@ pub fn run(
     context: &Context,
 ) -> Result<(Results, PathBuf)> {
     let is_new = !output.exists();
-    let _lock = output_folder::claim(output, &["results.json"])?;
+    let _lock = output_folder::claim(output, &[output_folder::RESULTS])?;
     run_record::check(output)?;
     eval_until::refuse_fixed(output)?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
@@ -378,7 +378,7 @@ pub fn run(
         files::remove_empty_folder(output)?;
     }
     let results = results?;
-    let file = output.join("results.json");
+    let file = output.join(output_folder::RESULTS);
     publish(output, results.runs.iter().flat_map(|run| &run.videos))?;
     write_json(&file, &results)?;
     run_record::write(output, false)?;

@@ -2,7 +2,7 @@
 
 use super::Context;
 use super::eval::{run_options, write_json};
-use super::output_folder;
+use super::output_folder::{self, RESULTS};
 use super::progress::control;
 use super::run_record;
 use crate::resolver::HomeResolver;
@@ -21,8 +21,8 @@ pub fn run(
     (output, videos): (&Path, usize),
     context: &Context,
 ) -> Result<(Results, PathBuf)> {
-    let (is_new, file) = (!output.exists(), output.join("results.json"));
-    let _lock = output_folder::claim(output, &["results.json"])?;
+    let (is_new, file) = (!output.exists(), output.join(RESULTS));
+    let _lock = output_folder::claim(output, &[RESULTS])?;
     run_record::check(output)?;
     let earlier = (resume && file.exists()).then(|| swm_report::read_results(&file)).transpose()?;
     let options = run_options(envs, (videos > 0).then(|| (output.to_owned(), videos)), context);
@@ -49,7 +49,7 @@ pub fn run(
 /// # Errors
 /// When the folder has such results.
 pub fn refuse_fixed(output: &Path) -> Result<()> {
-    let file = output.join("results.json");
+    let file = output.join(RESULTS);
     let found = if file.exists() { swm_report::read_results(&file).ok() } else { None };
     match found.and_then(|results| results.stopping) {
         Some(stopping) => {

@@ -27,6 +27,7 @@ mod output;
 mod output_folder;
 mod planner;
 mod plot;
+mod pretrained;
 mod probe;
 mod progress;
 mod pull;

@@ -110,8 +110,9 @@ fn escaped_json(json: &str) -> Cow<'_, str> {
 const LONGEST_WORD: usize = 24;
 /// The width that every column gets before words of other columns are kept whole.
 const NARROW: usize = 10;
-/// The most characters of a cell.
+/// The most characters of a line of a cell, and the most lines of a cell.
 const MAX_CELL: usize = 400;
+const MAX_LINES: usize = 100;
 
 /// Returns the width of the longest word of each column.
 fn longest_words(header: &[&str], rows: &[Vec<String>]) -> Vec<usize> {
@@ -164,13 +165,17 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
     format!("{table}\n").replace('\x1b', escape())
 }
 
-/// Returns a cell of at most [`MAX_CELL`] characters: every line of a table is as wide as its longest cell in a pipe.
-fn shortened(mut cell: String) -> String {
-    if let Some((end, _)) = cell.char_indices().nth(MAX_CELL) {
-        cell.truncate(end);
-        cell.push('…');
-    }
-    cell
+/// Returns a cell of at most [`MAX_LINES`] lines of [`MAX_CELL`] characters: every line of a table is as wide as its longest cell
+/// in a pipe.
+fn shortened(cell: String) -> String {
+    let shown = |line: &str| match line.char_indices().nth(MAX_CELL) {
+        Some((end, _)) => format!("{}…", &line[..end]),
+        None => line.to_owned(),
+    };
+    let mut lines = cell.split('\n');
+    let mut all: Vec<String> = lines.by_ref().take(MAX_LINES).map(shown).collect();
+    all.extend(lines.next().map(|_| "…".to_owned()));
+    all.join("\n")
 }
 
 /// How a cell stands out.
@@ -215,6 +220,11 @@ mod tests {
         let shown = table(&["column", "values"], [vec!["é".repeat(100_000), "1".to_owned()]]);
         assert!(shown.contains('…') && shown.chars().count() < 10 * MAX_CELL, "{} characters", shown.chars().count());
         assert_eq!(shortened("é".repeat(MAX_CELL)), "é".repeat(MAX_CELL));
+        // The settings of a solver are a line each.
+        let lines = vec!["state_optimizer.epsilon=0.00000001"; 30].join("\n");
+        assert_eq!(shortened(lines.clone()), lines);
+        let cut = shortened("a\n".repeat(100_000));
+        assert!(cut.ends_with("\n…") && cut.lines().count() == MAX_LINES + 1, "{} lines", cut.lines().count());
     }
 
     #[test]

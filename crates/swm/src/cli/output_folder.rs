@@ -1,5 +1,6 @@
 //! The output folder of a command.
 
+use super::eval::TRACES;
 use super::run_record;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
@@ -7,6 +8,9 @@ use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
 use swm_eval::STAGED;
+
+/// The file of an evaluation's results, in its folder.
+pub const RESULTS: &str = "results.json";
 
 /// Creates the folder that a command writes these files to, and keeps other writers away until the lock is dropped. A
 /// command calls this before its work, so that hours of it are not lost because its results cannot be written. Deletes what a
@@ -24,7 +28,7 @@ pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     check_writable(folder)?;
     check(folder, names)?;
     files::delete_temporary(folder, |name| names.contains(&name))?;
-    if names.contains(&"results.json") {
+    if names.contains(&RESULTS) {
         delete_temporary_of_evaluation(folder)?;
     }
     Ok(lock)
@@ -68,6 +72,27 @@ fn delete_temporary_of_evaluation(folder: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Returns a file in the folder of an evaluation that no evaluation writes, if there is one.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn foreign_file(folder: &Path) -> Result<Option<PathBuf>> {
+    let is_of_evaluation = |name: &PathBuf| {
+        let path = folder.join(name);
+        match name.to_str() {
+            Some(RESULTS | TRACES) => is_own(&path),
+            Some(run_record::FILE) => run_record::check(folder).is_ok(),
+            Some(text) => {
+                let video = text.strip_prefix(STAGED).map_or(text, |text| text.trim_start_matches('/'));
+                let is_marked = || swm_data::check_mp4(&path).is_ok() || swm_data::check_png(&path).is_ok();
+                video.strip_prefix("videos/").is_some_and(|name| !name.contains('/') && is_video(name)) && is_marked()
+            }
+            None => false,
+        }
+    };
+    Ok(files::list(folder)?.into_iter().find(|name| !is_of_evaluation(name)))
+}
+
 /// Returns whether a name is that of a video of an evaluation or of its poster, such as `random-in-distribution-0.mp4`.
 fn is_video(name: &str) -> bool {
     let stem = name.strip_suffix(".mp4").or_else(|| name.strip_suffix(".png")).unwrap_or_default();
@@ -107,7 +132,7 @@ fn is_own(path: &Path) -> bool {
         Some(name) if name.ends_with(".html") => is_page(path),
         Some("table.csv" | "table.tex" | "table.md") => is_page(&path.with_file_name("index.html")),
         Some("autopsy.json") => serde_json::from_slice::<StoredAutopsy>(&read(path)).is_ok(),
-        Some("traces.json") => serde_json::from_slice::<Vec<StoredPlan>>(&read(path)).is_ok(),
+        Some(TRACES) => serde_json::from_slice::<Vec<StoredPlan>>(&read(path)).is_ok(),
         _ => serde_json::from_slice::<StoredResults>(&read(path)).is_ok_and(|found| found.manifest.kind == "evaluate"),
     }
 }
@@ -161,7 +186,7 @@ struct StoredPlan {
 /// The heading of every page of this program.
 const PAGE_MARK: &str = "<p class=\"eyebrow\">stable-worldmodel</p>";
 /// The largest existing output file that is recognised as the program's own.
-const MAX_OUTPUT_BYTES: u64 = 1 << 30;
+pub const MAX_OUTPUT_BYTES: u64 = 1 << 30;
 
 /// Checks, before the work, that a command can write its one output file.
 ///

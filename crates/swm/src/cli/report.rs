@@ -1,6 +1,6 @@
 //! `swm report`: writes one self-contained HTML page of results.
 
-use super::output_folder;
+use super::output_folder::{self, RESULTS};
 use super::training_curves::{log_of, of_results};
 use super::{emit, emit_json};
 use crate::home;
@@ -35,7 +35,7 @@ pub struct ReportArgs {
 /// When it does not exist.
 pub(super) fn results_file(given: &Path) -> swm_core::Result<PathBuf> {
     let (file, problem) = match given.is_dir() {
-        true => (given.join("results.json"), "has no results.json"),
+        true => (given.join(RESULTS), "has no results.json"),
         false => (given.to_owned(), "does not exist"),
     };
     if !file.exists() {

@@ -1,7 +1,7 @@
 //! `swm reproduce`: repeats an evaluation from its results and lists the differences.
 
 use super::eval::{run_options, write_json};
-use super::output_folder;
+use super::output_folder::{self, RESULTS};
 use super::progress::control;
 use super::report::results_file;
 use super::results_tables::summary;
@@ -52,7 +52,7 @@ pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> 
     }
     let repeated = swm_eval::reproduce::reproduce(&old, &resolver, &options, &mut control(context))?;
     if let Some(output) = &args.output {
-        write_json(&output.join("results.json"), &repeated.results)?;
+        write_json(&output.join(RESULTS), &repeated.results)?;
     }
     let (holds, differences) = (repeated.holds(), &repeated.differences);
     if context.json {
@@ -77,9 +77,9 @@ pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> 
 /// As [`output_folder::claim`], and when the new results would replace the results that they are compared with.
 fn claim(folder: &Path, old: &Path) -> Result<Lock> {
     let same = |a: &Path, b: &Path| a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
-    if same(&folder.join("results.json"), old) {
+    if same(&folder.join(RESULTS), old) {
         let fix = "give another folder with --output";
         return Err(Error::config(old.display().to_string(), "would be replaced by the new results", fix));
     }
-    output_folder::claim(folder, &["results.json"])
+    output_folder::claim(folder, &[RESULTS])
 }

@@ -1,8 +1,9 @@
 //! `swm train`: trains a model on a dataset or online in an environment, or runs a recipe.
 
 use super::devices::DeviceArgs;
+use super::pretrained::pretrained_weights;
 use super::progress::{control, print_summary};
-use super::recipes::{self, RecipeRun};
+use super::recipes::lines;
 use super::trackers::{Tracker, Trackers};
 use super::{Context, emit, emit_json, eprint, output, run_record, train_folder};
 use crate::home;
@@ -31,7 +32,7 @@ pub struct TrainArgs {
     pub(super) recipe: Option<String>,
     /// Allow a recipe from a file to choose any name
     #[arg(long, requires = "recipe")]
-    trust: bool,
+    pub(super) trust: bool,
     /// The dataset: a path or a name
     #[arg(long, value_name = "DATASET")]
     pub(super) data: Option<String>,
@@ -51,7 +52,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "CHECKPOINT")]
     encoder: Option<String>,
     #[command(flatten)]
-    device: DeviceArgs,
+    pub(super) device: DeviceArgs,
     /// Folder that keeps the features of fixed filters for later runs
     ///
     /// Encoders such as keypoints have a part that is not trained. Its features of a dataset are computed once, at the
@@ -74,12 +75,8 @@ pub struct TrainArgs {
     pub(super) settings: Vec<String>,
 }
 
-/// Runs `swm train`.
+/// Runs `swm train` without a recipe.
 pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
-    if let (Some(recipe), Some(output)) = (&args.recipe, &args.output) {
-        let settings = args.model.iter().chain(&args.settings).map(String::as_str).collect();
-        return recipes::run(&RecipeRun { recipe, output: Path::new(output), settings, trust: args.trust }, context);
-    }
     if args.model.is_none() {
         return train(&args.started()?, context);
     }
@@ -101,11 +98,8 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
 
 /// Trains the model of a command line; returns the checkpoint, and the summary of the run as JSON.
 pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf, Value)> {
-    let (family, config) = (args.family()?, args.config()?);
-    if args.encoder.is_some() && !family.borrows_encoder {
-        let problem = format!("{} trains its own encoder", family.id);
-        anyhow::bail!(Error::config("--encoder", problem, "remove the flag, or train inverse"));
-    }
+    let config = args.config()?;
+    args.check()?;
     let options = TrainOptions {
         resume: args.resume,
         device: args.device.open()?,
@@ -114,11 +108,6 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
         feature_cache: args.feature_cache.clone(),
         ..TrainOptions::default()
     };
-    // clap drops the requirement of --env when --data excludes it.
-    if let (None, Some(_)) = (&args.env, args.max_steps) {
-        let problem = "limits the episodes of an environment, and this training plays none";
-        anyhow::bail!(Error::config("--max-steps", problem, "remove it, or train online with --env"));
-    }
     if let Some(env) = &args.env {
         return train_online(args, env, &*config, options, context);
     }
@@ -253,7 +242,7 @@ impl TrainArgs {
         }
         if StoredCheckpoint::read(&folder).is_err() {
             // The run begins, and what is no file would be looked for on the hub of models.
-            for (key, from) in recipes::pretrained_weights(&started.config()?.to_json()) {
+            for (key, from) in pretrained_weights(&started.config()?.to_json()) {
                 if !Path::new(&from).is_file() {
                     origin.check_user(
                         &format!("the pretrained weights '{from}'"),
@@ -268,6 +257,24 @@ impl TrainArgs {
         // Only the user may ask for a tracker, which is a program, and name another folder that is written to.
         let (log, feature_cache) = (self.log.clone(), self.feature_cache.clone());
         Ok(Self { data, output, resume: true, print_config: false, trust: false, log, feature_cache, ..started })
+    }
+
+    /// Checks the options against each other and the family. Reads no dataset.
+    ///
+    /// # Errors
+    /// When one contradicts another.
+    pub(super) fn check(&self) -> Result<()> {
+        let family = self.family()?;
+        if self.encoder.is_some() && family.borrows_encoder.is_none() {
+            let problem = format!("{} trains its own encoder", family.id);
+            return Err(Error::config("--encoder", problem, "remove the flag, or train inverse"));
+        }
+        // clap drops the requirement of --env when --data excludes it.
+        if let (None, Some(_)) = (&self.env, self.max_steps) {
+            let problem = "limits the episodes of an environment, and this training plays none";
+            return Err(Error::config("--max-steps", problem, "remove it, or train online with --env"));
+        }
+        Ok(())
     }
 
     /// Returns the family of the model.
@@ -324,7 +331,7 @@ fn check_preset_file(preset: &str) -> Result<()> {
     let text = String::from_utf8_lossy(&files::read(Path::new(preset), MAX_PRESET)?).into_owned();
     let parsed: std::result::Result<toml::Table, _> = toml::from_str(&text);
     parsed.map(drop).map_err(|error| {
-        let problem = format!("{}{}", error.message(), recipes::lines::of_error(&text, &error));
+        let problem = format!("{}{}", error.message(), lines::of_error(&text, &error));
         Error::config(format!("preset {preset}"), problem, "correct the file")
     })
 }

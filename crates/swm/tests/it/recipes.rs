@@ -105,7 +105,7 @@ fn recipes_are_listed_and_checked_before_they_run() {
     };
     refused("episodes = 12", "episode = 12", 2, &["[[collect]] 'rooms' of the recipe (line ", "--episodes"]);
     refused("budget = 10", "budget = \"ten\"", 2, &["[[eval]] 'found'", "ten"]);
-    refused("steps = 2", "setps = 2", 2, &["did you mean"]);
+    refused("steps = 2", "setps = 2", 2, &["did you mean", "[[train]] 'small' of the recipe (line "]);
     refused("model = \"lewm\"", "model = \"lwem\"", 2, &["did you mean lewm"]);
     refused("name = \"small\"", "name = \"../small\"", 2, &["'../small'"]);
     refused("name = \"small\"", "name = \"rooms\"", 2, &["two steps have the name 'rooms' (line "]);
@@ -152,6 +152,91 @@ fn recipes_are_listed_and_checked_before_they_run() {
 }
 
 #[test]
+fn outputs_that_steps_use_are_made_before_them() {
+    let swm = Swm::new();
+    let (small, trained) = ("model = \"lewm\"", "model = \"gcbc\"\ndata = \"rooms\"\n\n");
+    let acts = "[[train]]\nname = \"acts\"\nmodel = \"inverse\"\nencoder = \"late\"\ndata = \"rooms\"\n\n";
+    let late = format!("[[train]]\nname = \"late\"\n{trained}");
+    let [before, after] = [format!("{acts}{late}[[eval]]"), format!("{late}{acts}[[eval]]")];
+    for (from, to, part) in [
+        ("data = \"rooms\"", "data = \"small\"", "'data' names the step 'small', which is the step itself"),
+        (
+            small,
+            "model = \"inverse\"\nencoder = \"small\"",
+            "'encoder' names the step 'small', which is the step itself",
+        ),
+        (small, "model = \"inverse\"\nencoder = \"rooms\"", "which is a step of [[collect]], and no training"),
+        ("[\"small\"]", "[\"rooms\"]", "'policies' names the step 'rooms', which is a step of [[collect]]"),
+        ("[\"explore:0.7\", \"random:0.3\"]", "\"small\"", "datasets are collected before any model is trained"),
+        ("image = 32 }", "image = 32, model.weights = \"small\" }", "'model.weights' names the step 'small'"),
+        ("[[eval]]", &before, "'encoder' names the step 'late', which runs after it"),
+        ("[[eval]]", &after, "'encoder' names the step 'late', which trains 'gcbc'"),
+        (small, "model = \"lewm\"\nencoder = \"/runs/other\"", "lewm trains its own encoder"),
+        ("[\"small\"]", "[\"rooms\"]", "write ./rooms, if a path is meant"),
+    ] {
+        write(&swm, "bad.toml", &RECIPE.replacen(from, to, 1));
+        swm.fails(&["train", "--recipe", "bad.toml", "-o", "bad"], 2, &["of the recipe (line ", part]);
+        assert!(!swm.path("bad").exists(), "{to}");
+    }
+    let device = "device = \"abacus:0\"";
+    for (from, step) in [(small, "'small' of the recipe (line "), ("budget = 10", "'found' of the recipe (line ")] {
+        write(&swm, "bad.toml", &RECIPE.replacen(from, &format!("{from}\n{device}"), 1));
+        let parts = ["unknown device 'abacus'", step];
+        swm.fails(&["train", "--recipe", "bad.toml", "-o", "bad"], 2, &parts);
+        assert!(!swm.path("bad").exists(), "{step}");
+    }
+}
+
+/// A recipe of one small collection.
+const FEW: &str = r#"
+summary = "Few episodes"
+
+[[collect]]
+name = "rooms"
+env = "swm/TwoRoom-v1"
+policy = "random"
+episodes = 2
+max-steps = 10
+no-pixels = true
+"#;
+
+#[test]
+fn longer_datasets_are_used_only_where_a_recipe_allows_them() {
+    let swm = Swm::new();
+    write(&swm, "few.toml", FEW);
+    fs::create_dir(swm.path("run")).expect("a folder");
+    let longer = ["swm/TwoRoom-v1", "--policy", "random", "--episodes", "3", "--max-steps", "10", "--no-pixels"];
+    swm.json(&[&["collect", "-o", "run/rooms.lance"], &longer[..]].concat());
+    let args = ["train", "--recipe", "few.toml", "-o", "run"];
+    swm.fails(&args, 2, &["run/rooms.lance", "3 episodes", "'rooms' asks for 2", "more-episodes = true"]);
+    // What the recipe allows now is no other run.
+    write(&swm, "few.toml", &FEW.replace("episodes = 2", "episodes = 2\nmore-episodes = true"));
+    swm.json(&args);
+    assert_eq!(swm.json(&["inspect", "run/rooms.lance"])["episodes"], 3);
+    // A finished step is compared with the recipe as it is now.
+    write(&swm, "few.toml", FEW);
+    swm.fails(&args, 2, &["3 episodes", "'rooms' asks for 2"]);
+    // A dataset with the recorded hash is the one; changed settings ask for another.
+    fs::remove_file(swm.path("run/recipe.json")).expect("removing the record");
+    let hash = swm.json(&["inspect", "run/rooms.lance", "--checksum"])["content_hash"].clone();
+    let recorded = format!("episodes = 2\nhash = {hash}");
+    write(&swm, "few.toml", &FEW.replace("episodes = 2", &recorded));
+    assert_eq!(swm.json(&args)["hashes"][0]["hash"], hash);
+    fs::remove_file(swm.path("run/recipe.json")).expect("removing the record");
+    swm.fails(&[&args[..], &["rooms.seed=9"]].concat(), 2, &["3 episodes", "'rooms' asks for 2"]);
+    write(&swm, "few.toml", &FEW.replace("episodes = 2", "episodes = 2\nmore-episodes = \"yes\""));
+    swm.fails(&["train", "--recipe", "few.toml", "-o", "other"], 2, &["[[collect]] 'rooms'", "--more-episodes"]);
+}
+
+#[test]
+fn folders_that_datasets_cannot_be_written_to_are_not_made() {
+    let swm = Swm::new();
+    write(&swm, "few.toml", FEW);
+    swm.fails(&["train", "--recipe", "few.toml", "-o", "a\nb"], 2, &["a\\nb", "control character"]);
+    assert!(!swm.path("a\nb").exists());
+}
+
+#[test]
 fn columns_of_a_model_are_compared_with_the_collection_before_a_recipe_runs() {
     let swm = Swm::new();
     for (from, to, parts) in [
@@ -192,7 +277,11 @@ fn training_of_a_recipe_begins_with_the_weights_of_an_earlier_one() {
     assert!(config.contains("chain/first/checkpoint/weights.safetensors"), "{config}");
     // A later training is no source of weights.
     write(&swm, "late.toml", &format!("{collect}{}{}", step("first", "second"), step("second", "")));
-    swm.fails(&["train", "--recipe", "late.toml", "-o", "late"], 2, &["'second'", "--trust"]);
+    swm.fails(
+        &["train", "--recipe", "late.toml", "-o", "late"],
+        2,
+        &["[[train]] 'first'", "names the step 'second', which runs after it"],
+    );
 }
 
 #[test]
@@ -261,4 +350,56 @@ fn recipe_notices_outputs_that_were_replaced() {
     swm.json(&[&["collect"], &other[..]].concat());
     let recorded = first[0]["hash"].as_str().expect("a hash");
     swm.fails(&args, 1, &["rooms.lance", recorded, "remove it"]);
+}
+
+#[test]
+fn results_of_an_evaluation_are_those_that_the_recipe_made() {
+    let swm = Swm::new();
+    let step = |name: &str, seed: u64| {
+        format!(
+            "[[eval]]\nname = \"{name}\"\npolicies = [\"expert\"]\nenv = \"swm/TwoRoom-v1\"\nepisodes = 2\nbudget = 5\n\
+             no-pixels = true\nseed = {seed}\n"
+        )
+    };
+    write(&swm, "played.toml", &format!("summary = \"s\"\n{}{}", step("one", 0), step("two", 9)));
+    let args = ["train", "--recipe", "played.toml", "-o", "run"];
+    swm.json(&args);
+    let [one, two, state] =
+        ["one/results.json", "two/results.json", "recipe.json"].map(|name| swm.path("run").join(name));
+    let own = fs::read(&one).expect("the results");
+    fs::copy(&two, &one).expect("replacing the results");
+    swm.fails(&args, 1, &["run/one", "its hash is", "choose another folder"]);
+    fs::write(&one, own).expect("restoring the results");
+    swm.json(&args);
+
+    // An output that was made from other datasets and weights than those there.
+    let stored = fs::read(&state).expect("the record");
+    let mut other: Value = serde_json::from_slice(&stored).expect("JSON");
+    other["inputs"]["two"] = other["finished"]["two"].clone();
+    fs::write(&state, other.to_string()).expect("the record of other inputs");
+    swm.fails(&args, 1, &["run/two", "made from other outputs of earlier steps", "move it away"]);
+    fs::write(&state, stored).expect("restoring the record");
+
+    // A run of an older version has no hash.
+    let mut older: Value = serde_json::from_slice(&fs::read(&state).expect("the record")).expect("JSON");
+    let recorded = older["finished"]["one"].take();
+    assert_eq!(recorded.as_str().map(str::len), Some(64));
+    older["finished"]["one"] = "".into();
+    fs::write(&state, older.to_string()).expect("the record of an older version");
+    swm.json(&args);
+
+    // Without its results, an evaluation is repeated, unless its folder has files of the user.
+    fs::remove_file(&one).expect("removing the results");
+    fs::write(swm.path("run/one/notes.txt"), "mine").expect("a note");
+    swm.fails(&args, 1, &["run/one", "notes.txt", "move the folder away"]);
+    fs::remove_file(swm.path("run/one/notes.txt")).expect("removing the note");
+    fs::create_dir(swm.path("run/one/videos")).expect("a folder");
+    let video = swm.path("run/one/videos/expert-in-distribution-0.mp4");
+    fs::write(&video, "mine").expect("a file that is no video of an evaluation");
+    swm.fails(&args, 1, &["run/one", "expert-in-distribution-0.mp4", "move the folder away"]);
+    fs::remove_dir_all(swm.path("run/one/videos")).expect("removing the folder");
+    swm.json(&args);
+    assert!(one.is_file() && swm.path("run/one/run.json").is_file());
+    fs::copy(&two, &one).expect("replacing the results");
+    swm.fails(&args, 1, &["run/one", "its hash is"]);
 }

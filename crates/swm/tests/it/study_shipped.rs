@@ -283,6 +283,67 @@ fn a_study_collects_the_datasets_that_it_needs() {
     swm.fails(&["study", "run", "study.toml", "--small", "--output", "none"], 2, &["small size", "[small.defaults]"]);
 }
 
+/// A study of the expert from the starts of a dataset that it collects.
+const PLAYED: &str = r#"
+title = "Recorded goals"
+question = "Are recorded goals reached?"
+[[collect]]
+name = "rooms"
+env = "swm/TwoRoom-v1"
+policy = "expert"
+episodes = 3
+max-steps = 30
+no-pixels = true
+[defaults]
+env = "swm/TwoRoom-v1"
+episodes = 2
+budget = 5
+goal-offset = 5
+no-pixels = true
+[[starts]]
+name = "recorded"
+dataset = "rooms"
+[[condition]]
+name = "as recorded"
+[[policy]]
+name = "expert"
+policy = "expert"
+"#;
+
+#[test]
+fn a_study_uses_no_other_dataset_than_the_one_that_it_collects() {
+    let swm = Swm::new();
+    let write = |text: &str| std::fs::write(swm.path("study.toml"), text).expect("writing the study");
+    let run = |output| ["study", "run", "study.toml", "--output", output, "--trust"];
+    write(PLAYED);
+    let first = swm.json(&run("first"));
+    // What an earlier study collected is used.
+    assert_eq!(swm.json(&run("second"))["rows"], first["rows"]);
+    let hash = swm.json(&["inspect", "rooms", "--checksum"])["content_hash"].as_str().expect("a hash").to_owned();
+    let recorded = format!("hash = \"{hash}\"");
+    for (from, to, parts) in [
+        (
+            "policy = \"expert\"",
+            "policy = \"random\"",
+            &["policy \"expert\"", "'rooms' asks for policy \"random\"", &recorded][..],
+        ),
+        ("episodes = 3", "episodes = 3\nseed = 9", &["seed 0", "seed 9"]),
+        ("max-steps = 30", "max-steps = 20", &["max_episode_steps 30", "max_episode_steps 20"]),
+        ("episodes = 3", "episodes = 2", &["3 episodes", "'rooms' asks for 2", "more-episodes = true"]),
+    ] {
+        write(&PLAYED.replacen(from, to, 1));
+        swm.fails(&run("third"), 2, &[&["study.toml", "rooms.lance", "move"], parts].concat());
+        assert!(!swm.path("third").exists(), "{to}");
+    }
+    // A dataset with the hash that the table names is the one.
+    write(&PLAYED.replacen("episodes = 3", &format!("episodes = 2\nhash = \"{hash}\""), 1));
+    assert_eq!(swm.json(&run("fourth"))["rows"], first["rows"]);
+    write(&PLAYED.replacen("episodes = 3", "episodes = 2\nmore-episodes = true", 1));
+    assert_eq!(swm.json(&run("fifth"))["rows"], first["rows"]);
+    let commands = text(&swm.run(&["study", "run", "study.toml", "--commands"]).stdout);
+    assert!(commands.starts_with("swm collect --output=rooms ") && !commands.contains("more"), "{commands}");
+}
+
 #[test]
 fn a_registered_study_says_whether_it_is_still_the_same() {
     let swm = Swm::new();

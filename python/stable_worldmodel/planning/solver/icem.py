@@ -16,7 +16,7 @@ class ICEMSolver(GaussianSolver):
 
     Args:
         cost, batch_size, num_samples, var_scale, n_steps, topk, device, seed, callbacks: As for `CEMSolver`.
-        noise_beta: The exponent of the noise's spectrum: 0 is white, 1 pink, 2 red.
+        noise_beta: The exponent of the noise's spectrum, at most 10: 0 is white, 1 pink, 2 red.
         alpha: The weight of the previous distribution.
         n_elite_keep: Elites that are candidates of the next iteration.
         return_mean: Must be true: the plan is the mean of the distribution.

@@ -102,6 +102,12 @@ fn world(setup: &Setup, image: Option<usize>, threads: usize) -> Result<World> {
     World::new(setup.env.clone(), WorldConfig { envs: 1, image, threads, ..WorldConfig::default() })
 }
 
+/// Restores the present step of a tree in an environment.
+fn restore(world: &mut World, tree: &Tree) -> Result<()> {
+    let snapshot = tree.snapshot();
+    world.modify(&[0], |_, env| env.restore(snapshot))
+}
+
 /// Returns the positions of the state, the distance to the goal and whether it is reached.
 fn observed(world: &World, positions: &[Position]) -> Result<(Vec<[f32; 2]>, f64, bool)> {
     let state = world.pool().infos().row(0).to_f64(columns::STATE)?;
@@ -263,18 +269,24 @@ impl<'a> PlanSession<'a> {
             Error::unknown("model", &settings.model, names, "reload the page, which lists the models")
         })?;
         let config = settings.mpc(&model, self.spec())?;
+        // What is refused leaves the environment and the planner as they are.
+        let mut other = None;
         if self.world.pool().image() != model.image.map(|side| (side, side)) {
-            self.world = world(&self.setup, model.image, self.threads)?;
-            self.restore()?;
+            let mut world = world(&self.setup, model.image, self.threads)?;
+            restore(&mut world, &self.tree)?;
+            other = Some(world);
         }
-        let observer = Box::new(self.watch.clone());
-        let Planner { policy, scale, predictor } = self.planners.planner(settings, &model, &self.world, observer)?;
+        let (world, observer) = (other.as_ref().unwrap_or(&self.world), Box::new(self.watch.clone()));
+        let Planner { policy, scale, predictor } = self.planners.planner(settings, &model, world, observer)?;
         let codec = Codec::new(&self.spec().action_space, scale);
         let imagination = match (predictor, model.image) {
             (Some(predictor), Some(side)) => Imagination::new(predictor, side)?,
             _ => None,
         };
         let steps = config.receding_horizon * config.action_block;
+        if let Some(world) = other {
+            self.world = world;
+        }
         let in_use = InUse { policy, model: model.name.clone(), imagination, codec, steps };
         let had_one = self.in_use.replace(in_use).is_some();
         self.searched_at = None;
@@ -301,8 +313,7 @@ impl<'a> PlanSession<'a> {
 
     /// Restores the present step in the environment.
     fn restore(&mut self) -> Result<()> {
-        let snapshot = self.tree.snapshot();
-        self.world.modify(&[0], |_, env| env.restore(snapshot))
+        restore(&mut self.world, &self.tree)
     }
 
     /// Starts the episode of the seed and the factors.

@@ -2,6 +2,7 @@
 
 use super::agent::Agent;
 use super::map::{Map, TELEPORT_RADIUS, UNIT, center};
+use crate::physics::compile_spec;
 use crate::{assets, link};
 use mujoco_rs::mujoco_c::_mjtGeomBase::{self, mjGEOM_BOX, mjGEOM_CYLINDER};
 use mujoco_rs::wrappers::MjModel;
@@ -57,7 +58,7 @@ pub fn compile(agent: Agent, map: &Map, pixels: bool) -> Result<MjModel> {
     } else {
         marker(&mut spec, "target", "target", [0.0; 2], GOAL_RADIUS);
     }
-    spec.compile().map_err(|error| failed(&error))
+    compile_spec(&mut spec).map_err(|error| failed(&error))
 }
 
 /// Removes an element from its description.

@@ -7,6 +7,7 @@
 #![allow(unsafe_code, reason = "`mjs_attach`, which `mujoco-rs` does not wrap")]
 
 use super::config::{Bounds, TableConfig};
+use crate::physics::compile_spec;
 use crate::{assets, link};
 use mujoco_rs::mujoco_c::{_mjtGeomBase, mjs_attach, mjtCone, mjtIntegrator};
 use mujoco_rs::wrappers::MjModel;
@@ -77,7 +78,7 @@ pub fn compile(config: &TableConfig, arm_rendering: ArmRendering) -> Result<MjMo
     }
     bounding_box(world, "object_bounds", &at_cube_height(config.object_bounds), [0.6, 0.3, 0.3, 0.2]);
     bounding_box(world, "arm_bounds", &config.arm_bounds, [0.3, 0.6, 0.3, 0.2]);
-    let mut model = arena.compile().map_err(|error| Error::external("compiling OGBench's table", error))?;
+    let mut model = compile_spec(&mut arena).map_err(|error| Error::external("compiling OGBench's table", error))?;
     configure_arm(&mut model, arm_rendering);
     Ok(model)
 }

@@ -3,6 +3,7 @@
 use super::eval_parts::{copy_videos, joined_traces, results_in};
 use super::{OnRayArgs, Request, without};
 use crate::cli::eval::{self, CapsuleStarts, EvalArgs, TRACES, write_json, write_traces};
+use crate::cli::output_folder::RESULTS;
 use crate::cli::progress::control;
 use crate::cli::results_tables::summary;
 use crate::cli::{Context, emit, emit_json, output_folder, run_record};
@@ -56,7 +57,7 @@ pub fn run(command: &EvalCommand, context: &Context) -> anyhow::Result<()> {
         return emit_json(&json!({"env": results.env, "runs": results.runs.len(), "ends": ends}));
     }
     emit(&summary(&results));
-    emit(&format!("{}\n", args.output.join("results.json").display()));
+    emit(&format!("{}\n", args.output.join(RESULTS).display()));
     Ok(())
 }
 
@@ -72,7 +73,7 @@ impl EvalCommand {
             request.check_rule(until, &eval::run_options(args.envs, recorded, context))?;
             cells["stages"] = json!(request.stages());
         }
-        let files = [("results.json", true), (run_record::FILE, true), ("videos", videos > 0), (TRACES, args.trace)];
+        let files = [(RESULTS, true), (run_record::FILE, true), ("videos", videos > 0), (TRACES, args.trace)];
         let written: Vec<&str> =
             files.into_iter().filter(|(_, is_written)| *is_written).map(|(name, _)| name).collect();
         self.on.check_new(&output, &written)?;
@@ -89,11 +90,11 @@ impl EvalCommand {
             }
             return Ok(results);
         };
-        let _lock = output_folder::claim(&args.output, &["results.json"])?;
+        let _lock = output_folder::claim(&args.output, &[RESULTS])?;
         let earlier = self.after.as_deref().map(swm_report::read_results).transpose()?;
         let options = eval::run_options(args.envs, (videos > 0).then(|| (args.output.clone(), videos)), context);
         let results = part.run_stage(episodes, earlier.as_ref(), resolver, &options, &mut control(context))?;
-        write_json(&args.output.join("results.json"), &results)?;
+        write_json(&args.output.join(RESULTS), &results)?;
         Ok(results)
     }
 
@@ -113,12 +114,12 @@ impl EvalCommand {
             Some(until) => results.stopped(until, request.episodes),
             None => results,
         };
-        let _lock = output_folder::claim(&args.output, &["results.json", TRACES])?;
+        let _lock = output_folder::claim(&args.output, &[RESULTS, TRACES])?;
         copy_videos(parts, conditions, &args.output)?;
         if args.trace {
             write_json(&args.output.join(TRACES), &joined_traces(parts, conditions)?)?;
         }
-        write_json(&args.output.join("results.json"), &results)?;
+        write_json(&args.output.join(RESULTS), &results)?;
         run_record::write_command(&args.output, command_of_one_process(&run_record::arguments(), &args.output))?;
         Ok(results)
     }

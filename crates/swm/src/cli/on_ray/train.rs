@@ -1,11 +1,13 @@
-//! `swm train`: one run here, or a sweep of runs on a Ray cluster.
+//! `swm train`: one run here, the steps of a recipe, or a sweep of runs on a Ray cluster.
 
 use super::{OnRayArgs, Request};
 use crate::cli::Context;
+use crate::cli::recipes::{self, RecipeRun};
 use crate::cli::train::{self, TrainArgs};
 use clap::Args;
 use serde_json::json;
 use std::collections::BTreeSet;
+use std::path::Path;
 use swm_core::{Error, Result};
 
 /// Arguments of `swm train`.
@@ -29,7 +31,9 @@ const MAX_RUNS: usize = 10_000;
 pub fn run(command: &TrainCommand, context: &Context) -> anyhow::Result<()> {
     let TrainCommand { args, on, sweep } = command;
     if !on.is_given() {
-        return train::train(args, context);
+        let (Some(recipe), Some(output)) = (&args.recipe, &args.output) else { return train::train(args, context) };
+        let settings = args.model.iter().chain(&args.settings).map(String::as_str).collect();
+        return recipes::run(&RecipeRun { recipe, output: Path::new(output), settings, trust: args.trust }, context);
     }
     let refused =
         [("--recipe", args.recipe.is_some()), ("--resume", args.resume), ("--print-config", args.print_config)];

@@ -72,8 +72,11 @@ pub enum Kind {
 const RESERVED: &[&str] =
     &["output", "resume", "overwrite", "shard", "format", "trust", "recipe", "print-config", "mix-renderers"];
 
+/// The option of a dataset that may have more episodes than its step asks for. It is no option of `swm collect`.
+const MORE_EPISODES: &str = "more-episodes";
+
 /// Options whose values may be names of earlier steps.
-const REFERENCES: &[&str] = &["data", "dataset", "encoder", "policies", "policy"];
+pub const REFERENCES: &[&str] = &["data", "dataset", "encoder", "policies", "policy"];
 
 impl Kind {
     /// The name of the command and of its tables.
@@ -101,6 +104,11 @@ impl Kind {
 }
 
 impl Step {
+    /// Whether a dataset that is there may have more episodes than the step asks for.
+    pub fn allows_more(&self) -> bool {
+        self.options.get(MORE_EPISODES).and_then(Value::as_bool).unwrap_or_default()
+    }
+
     /// Checks what becomes a positional argument: a second text, or a `=` in a key, would be another setting.
     fn check_texts(&self, kind: Kind) -> std::result::Result<(), String> {
         let key = kind.positional();
@@ -193,7 +201,8 @@ impl Recipe {
         of(Kind::Collect, &self.collect).chain(of(Kind::Train, &self.train)).chain(of(Kind::Eval, &self.eval))
     }
 
-    /// Changes an option or a setting: `STEP.OPTION=VALUE`, such as `rooms.episodes=20` or `lewm.optim.lr=3e-4`.
+    /// Changes an option or a setting: `STEP.OPTION=VALUE`, such as `rooms.episodes=20` or `lewm.optim.lr=3e-4`. The expected
+    /// hashes, which are those without changes, are dropped.
     ///
     /// # Errors
     /// When there is no such step, or the text has another form.
@@ -231,6 +240,7 @@ impl Recipe {
             }
             false => drop(step.options.insert(key.to_owned(), value)),
         }
+        self.collect.iter_mut().chain(&mut self.train).chain(&mut self.eval).for_each(|step| step.hash = None);
         Ok(())
     }
 
@@ -241,7 +251,10 @@ impl Recipe {
     pub fn request_hash(&self) -> Result<String> {
         let mut request = self.clone();
         let steps = request.collect.iter_mut().chain(&mut request.train).chain(&mut request.eval);
-        steps.for_each(|step| step.hash = None);
+        steps.for_each(|step| {
+            step.hash = None;
+            step.options.remove(MORE_EPISODES);
+        });
         let without = Self { recorded_on: None, summary: String::new(), ..request };
         let text = serde_json::to_string(&without).map_err(|error| Error::external("writing a recipe", error))?;
         Ok(manifest::hash(text.as_bytes()))
@@ -299,7 +312,9 @@ impl Recipe {
         let values =
             |key: &str, value: &Value| texts(value).into_iter().map(|text| resolve(key, text)).collect::<Vec<_>>();
         let mut arguments = vec![format!("--output={}", kind.output(folder, &step.name).display())];
-        for (key, value) in step.options.iter().filter(|(key, _)| *key != kind.positional()) {
+        let is_of_recipe = |key: &str, value: &Value| kind == Kind::Collect && key == MORE_EPISODES && value.is_bool();
+        let is_option = |key: &str, value: &Value| key != kind.positional() && !is_of_recipe(key, value);
+        for (key, value) in step.options.iter().filter(|(key, value)| is_option(key, value)) {
             match value {
                 Value::Boolean(true) => arguments.push(format!("--{key}")),
                 Value::Boolean(false) => {}
@@ -340,7 +355,7 @@ pub fn parse<T: Args>(kind: Kind, step: &Step, arguments: &[String]) -> Result<T
 }
 
 /// Returns the texts of a value: the elements of an array, or one text.
-fn texts(value: &Value) -> Vec<String> {
+pub fn texts(value: &Value) -> Vec<String> {
     match value {
         Value::Array(values) => values.iter().flat_map(texts).collect(),
         Value::String(text) => vec![text.clone()],
@@ -359,7 +374,7 @@ pub fn is_preset_name(text: &str) -> bool {
 }
 
 /// Returns the settings of nested tables under dotted keys.
-fn flat(table: &Table) -> Vec<(String, String)> {
+pub fn flat(table: &Table) -> Vec<(String, String)> {
     table
         .iter()
         .flat_map(|(key, value)| match value {

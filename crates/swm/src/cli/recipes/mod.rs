@@ -3,12 +3,13 @@
 mod datasets;
 mod file;
 pub(super) mod lines;
+mod references;
 mod run;
 mod text_check;
 
 pub use datasets::Datasets;
 pub use file::is_preset_name;
-pub use run::{RecipeRun, pretrained_weights, run};
+pub use run::{RecipeRun, run};
 pub use text_check::check_text;
 
 use super::{emit, emit_json, table};

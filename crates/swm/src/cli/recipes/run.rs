@@ -1,20 +1,23 @@
 //! Running a recipe: every step whose output is missing, then a comparison of the hashes.
 
+use super::datasets::{self, Found};
 use super::file::{self, Kind, Recipe, Step, parse};
-use super::text;
+use super::{references, text};
 use crate::capsule;
 use crate::cli::collect::{self, CollectArgs};
 use crate::cli::eval::{self, EvalArgs};
+use crate::cli::output_folder::{self, RESULTS};
+use crate::cli::pretrained::pretrained_weights;
 use crate::cli::train::{self, TrainArgs};
 use crate::cli::training_curves::of_checkpoint;
-use crate::cli::{Context, emit, emit_json, eprint, output_folder};
+use crate::cli::{Context, emit, emit_json, eprint};
 use crate::home;
 use crate::resolver::HomeResolver;
 use serde::{Deserialize, Serialize};
-use serde_json::{Value, json};
+use serde_json::json;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Origin, Result, Schema, files};
+use swm_core::{Error, Origin, Result, Schema, files, manifest};
 use swm_models::{StoredCheckpoint, checkpoint};
 use swm_report::ReportOptions;
 
@@ -45,8 +48,11 @@ struct State {
     settings: Vec<String>,
     /// The processor.
     processor: String,
-    /// The hash of the output of each finished step; empty for an evaluation.
+    /// The hash of the output of each finished step; older runs have none of an evaluation.
     finished: BTreeMap<String, String>,
+    /// For each finished step, the hash of those of the datasets and weights before it; older runs have none.
+    #[serde(default)]
+    inputs: BTreeMap<String, String>,
 }
 
 /// The comparison of a hash with the one in the recipe.
@@ -60,10 +66,7 @@ struct Compared<'a> {
 
 /// Runs the steps of a recipe whose outputs are missing, and writes a page.
 pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
-    if request.output.to_string_lossy().contains("://") {
-        let fix = "give a local folder; `swm convert` copies a dataset to a server";
-        anyhow::bail!(Error::config(request.output.display().to_string(), "is the address of a server", fix));
-    }
+    check_folder(request.output)?;
     let (text, origin) = text(request.recipe, request.trust)?;
     let mut recipe = Recipe::parse(request.recipe, &text)?;
     request.settings.iter().try_for_each(|setting| recipe.set(setting))?;
@@ -71,6 +74,7 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     let columns = check(&recipe, request.output)?;
     check_weights(&recipe, request, &origin)?;
     check_columns(&recipe, request.output, &columns)?;
+    check_devices(&recipe, request.output, &State::read(request, &recipe)?)?;
     let _lock = output_folder::claim(request.output, &["index.html"])?;
     files::delete_temporary(request.output, |name| name == STATE)?;
     // The folder may come from a stranger, whose links name folders of the user.
@@ -78,13 +82,12 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     let mut state = State::open(request, &recipe)?;
     let count = recipe.steps().count() + 1;
     for (index, (kind, step)) in recipe.steps().enumerate() {
-        let output = kind.output(request.output, &step.name);
-        if let Some(recorded) = state.finished.get(&step.name).filter(|_| output.exists()) {
-            check_output(kind, &output, recorded)?;
+        if state.is_finished(&recipe, (kind, step), request.output)? {
             continue;
         }
         eprint(&format!("{}/{count} {}: {}\n", index + 1, kind.name(), step.name));
         let hash = run_step(&recipe, kind, step, request.output, context)?;
+        state.inputs.insert(step.name.clone(), state.inputs_of(&recipe, step)?);
         state.finished.insert(step.name.clone(), hash);
         state.write(request.output)?;
     }
@@ -119,6 +122,23 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Checks that the outputs of a recipe can be written to a folder: Lance reads no path with control characters.
+///
+/// # Errors
+/// When it is the address of a server, or its path has a control character.
+fn check_folder(folder: &Path) -> Result<()> {
+    if folder.to_string_lossy().contains("://") {
+        let fix = "give a local folder; `swm convert` copies a dataset to a server";
+        return Err(Error::config(folder.display().to_string(), "is the address of a server", fix));
+    }
+    let path = std::path::absolute(folder).map_err(|error| Error::io(folder, "finding the folder", error))?;
+    if path.to_string_lossy().contains(char::is_control) {
+        let fix = "give a folder without such characters in its path";
+        return Err(Error::config(format!("{path:?}"), "has a line feed or another control character", fix));
+    }
+    Ok(())
+}
+
 /// The columns of the datasets that a recipe collects, by the paths of the datasets.
 pub(super) type Columns = BTreeMap<PathBuf, Schema>;
 
@@ -133,30 +153,42 @@ pub(super) fn check(recipe: &Recipe, folder: &Path) -> Result<Columns> {
     let resolver = HomeResolver::new(Origin::User);
     for (kind, step) in recipe.steps() {
         let arguments = recipe.arguments(kind, step, folder);
+        references::check(recipe, kind, step)
+            .map_err(|wrong| Error::config(place(kind, step, &wrong.problem), wrong.problem, wrong.fix))?;
         let checked = match kind {
             Kind::Collect => collect::check(&parse::<CollectArgs>(kind, step, &arguments)?)
                 .map(|schema| drop(columns.insert(kind.output(folder, &step.name), schema))),
-            Kind::Train => parse::<TrainArgs>(kind, step, &arguments)?.config().map(drop),
+            Kind::Train => {
+                let args = parse::<TrainArgs>(kind, step, &arguments)?;
+                args.config().and_then(|_| args.check())
+            }
             Kind::Eval => {
                 let is_output = |policy: &str| outputs.iter().any(|output| output == Path::new(policy));
-                parse::<EvalArgs>(kind, step, &arguments)?.check(&resolver, is_output)
+                let args = parse::<EvalArgs>(kind, step, &arguments)?;
+                args.check(&resolver, is_output)
             }
         };
-        checked.map_err(|error| match error {
-            // Its hint lists names.
-            Error::UnknownName { .. } => error,
-            error => of_step(kind, step, &error),
-        })?;
+        checked.map_err(|error| of_step(kind, step, error))?;
     }
     Ok(columns)
 }
 
 /// Names the step in an error of its options.
-fn of_step(kind: Kind, step: &Step, error: &Error) -> Error {
-    let problem = error.to_string();
-    let line = step.lines.of_problem(&problem);
-    let what = format!("[[{}]] '{}' of the recipe{line}", kind.name(), step.name);
-    Error::config(what, problem, "correct its options")
+fn of_step(kind: Kind, step: &Step, error: Error) -> Error {
+    let text = error.to_string();
+    let place = place(kind, step, &text);
+    match error {
+        // Callers tell unknown names apart by their kind.
+        Error::UnknownName { kind, given, nearest, hint } => {
+            Error::UnknownName { kind, given, nearest, hint: format!("{hint}; correct {place}") }
+        }
+        _ => Error::config(place, text, "correct its options"),
+    }
+}
+
+/// Returns where the option or setting of a step is that a problem names.
+fn place(kind: Kind, step: &Step, problem: &str) -> String {
+    format!("[[{}]] '{}' of the recipe{}", kind.name(), step.name, step.lines.of_problem(problem))
 }
 
 /// Checks that the datasets to collect have the columns that the trainings on them read, such as images of the model's size.
@@ -167,8 +199,28 @@ pub(super) fn check_columns(recipe: &Recipe, folder: &Path, columns: &Columns) -
     for step in &recipe.train {
         let args: TrainArgs = parse(Kind::Train, step, &recipe.arguments(Kind::Train, step, folder))?;
         if let Some(schema) = args.data.as_ref().and_then(|data| columns.get(Path::new(data))) {
-            args.config()?.check_columns(schema).map_err(|error| of_step(Kind::Train, step, &error))?;
+            args.config()?.check_columns(schema).map_err(|error| of_step(Kind::Train, step, error))?;
         }
+    }
+    Ok(())
+}
+
+/// Checks that the devices of the steps that are not finished can be opened: another machine may have had those of the others.
+///
+/// # Errors
+/// When one cannot be opened, or the folder of a finished evaluation has files that are not its own.
+fn check_devices(recipe: &Recipe, folder: &Path, state: &State) -> Result<()> {
+    for (kind, step) in recipe.steps() {
+        if state.finished.contains_key(&step.name) && output_exists(kind, &kind.output(folder, &step.name))? {
+            continue;
+        }
+        let arguments = recipe.arguments(kind, step, folder);
+        let checked = match kind {
+            Kind::Collect => Ok(()),
+            Kind::Train => parse::<TrainArgs>(kind, step, &arguments)?.device.check(),
+            Kind::Eval => parse::<EvalArgs>(kind, step, &arguments)?.device.check(),
+        };
+        checked.map_err(|error| of_step(kind, step, error))?;
     }
     Ok(())
 }
@@ -199,29 +251,19 @@ fn check_weights(recipe: &Recipe, request: &RecipeRun<'_>, origin: &Origin) -> R
     Ok(())
 }
 
-/// Returns the dotted keys of the pretrained weights in a configuration, with their values.
-pub fn pretrained_weights(config: &Value) -> Vec<(String, String)> {
-    let mut found = vec![];
-    weights("", config, &mut found);
-    found
-}
-
-/// Appends the dotted keys of all texts named `weights` in a configuration, with their values, to `found`.
-fn weights(prefix: &str, value: &Value, found: &mut Vec<(String, String)>) {
-    let below = |key: &str| if prefix.is_empty() { key.to_owned() } else { format!("{prefix}.{key}") };
-    match value {
-        Value::Object(entries) => {
-            for (key, value) in entries {
-                match value.as_str() {
-                    Some("") => {}
-                    Some(from) if key == "weights" => found.push((below(key), from.to_owned())),
-                    _ => weights(&below(key), value, found),
-                }
-            }
-        }
-        Value::Array(values) => values.iter().for_each(|value| weights(prefix, value, found)),
-        _ => {}
+/// Returns whether the output of a finished step is there. The other files of an evaluation are nothing without its
+/// results.
+///
+/// # Errors
+/// When the folder of an evaluation has no results, but files that are not of an evaluation.
+fn output_exists(kind: Kind, output: &Path) -> Result<bool> {
+    if kind != Kind::Eval || !output.exists() || output.join(RESULTS).exists() {
+        return Ok(output.exists());
     }
+    let Some(other) = output_folder::foreign_file(output)? else { return Ok(false) };
+    let problem = format!("it has no {RESULTS}, and holds {}, which is not of an evaluation", other.display());
+    let fix = "restore the results, or move the folder away, to evaluate again";
+    Err(Error::corrupt(output, problem, fix))
 }
 
 /// Checks that the output of a finished step is the one that the run recorded: otherwise another one was put in its
@@ -236,6 +278,10 @@ fn check_output(kind: Kind, output: &Path, recorded: &str) -> Result<()> {
     {
         return Err(Error::corrupt(output, fault, fix));
     }
+    // Older runs recorded no hash of an evaluation.
+    if kind == Kind::Eval && recorded.is_empty() {
+        return Ok(());
+    }
     let found = output_hash(kind, output)?;
     if found == recorded {
         return Ok(());
@@ -244,7 +290,7 @@ fn check_output(kind: Kind, output: &Path, recorded: &str) -> Result<()> {
     Err(Error::corrupt(output, problem, fix))
 }
 
-/// Returns the hash of a dataset or of weights; an evaluation has none.
+/// Returns the hash of a dataset, of weights, or of the file of an evaluation's results.
 fn output_hash(kind: Kind, output: &Path) -> Result<String> {
     match kind {
         Kind::Collect => home::open_dataset(&output.to_string_lossy())?.content_hash(),
@@ -252,7 +298,7 @@ fn output_hash(kind: Kind, output: &Path) -> Result<String> {
             let stored = StoredCheckpoint::read(output)?;
             Ok(stored.manifest().hashes.get("weights").cloned().unwrap_or_default())
         }
-        Kind::Eval => Ok(String::new()),
+        Kind::Eval => Ok(manifest::hash(&files::read(&output.join(RESULTS), output_folder::MAX_OUTPUT_BYTES)?)),
     }
 }
 
@@ -270,7 +316,12 @@ fn run_step(recipe: &Recipe, kind: Kind, step: &Step, folder: &Path, context: &C
     }
     match kind {
         Kind::Collect => {
-            collect::run_args(&parse(kind, step, &arguments)?, context)?;
+            let args: CollectArgs = parse(kind, step, &arguments)?;
+            let what = format!("the dataset {}", output.display());
+            if let Found::Recorded(hash) = datasets::find(step, &what, &output, &args)? {
+                return Ok(hash);
+            }
+            collect::run_args(&args, context)?;
         }
         Kind::Train => {
             train::run_args(&parse(kind, step, &arguments)?, context)?;
@@ -287,7 +338,7 @@ fn run_step(recipe: &Recipe, kind: Kind, step: &Step, folder: &Path, context: &C
 
 /// Writes the page of all evaluations; `None` without evaluations.
 fn report(recipe: &Recipe, request: &RecipeRun<'_>, context: &Context) -> Result<Option<PathBuf>> {
-    let files = recipe.eval.iter().map(|step| request.output.join(&step.name).join("results.json"));
+    let files = recipe.eval.iter().map(|step| request.output.join(&step.name).join(RESULTS));
     let results = files.map(|file| Ok((file.clone(), swm_report::read_results(&file)?))).collect::<Result<Vec<_>>>()?;
     if results.is_empty() {
         return Ok(None);
@@ -305,11 +356,23 @@ fn report(recipe: &Recipe, request: &RecipeRun<'_>, context: &Context) -> Result
 }
 
 impl State {
-    /// Reads the record of the run in the folder, or begins a new one.
+    /// Reads the record of the run in the folder, or writes a new one.
+    ///
+    /// # Errors
+    /// As [`State::read`].
+    fn open(request: &RecipeRun<'_>, recipe: &Recipe) -> Result<Self> {
+        let state = Self::read(request, recipe)?;
+        if !request.output.join(STATE).exists() {
+            state.write(request.output)?;
+        }
+        Ok(state)
+    }
+
+    /// Reads the record of the run in the folder; without one, returns that of a new run.
     ///
     /// # Errors
     /// When the folder holds a run of another recipe or with other settings.
-    fn open(request: &RecipeRun<'_>, recipe: &Recipe) -> Result<Self> {
+    fn read(request: &RecipeRun<'_>, recipe: &Recipe) -> Result<Self> {
         let path = request.output.join(STATE);
         let new = Self {
             recipe: request.recipe.to_owned(),
@@ -317,9 +380,9 @@ impl State {
             settings: request.settings.iter().map(ToString::to_string).collect(),
             processor: capsule::cpu_level(),
             finished: BTreeMap::new(),
+            inputs: BTreeMap::new(),
         };
         if !path.exists() {
-            new.write(request.output)?;
             return Ok(new);
         }
         let fix = "choose another folder with --output";
@@ -330,11 +393,48 @@ impl State {
             let problem = format!("it holds a run of the recipe {} with other settings or steps", found.recipe);
             return Err(Error::config(request.output.display().to_string(), problem, fix));
         }
-        Ok(Self { finished: found.finished, ..new })
+        Ok(Self { finished: found.finished, inputs: found.inputs, ..new })
     }
 
     fn write(&self, folder: &Path) -> Result<()> {
         eval::write_json(&folder.join(STATE), self)
+    }
+
+    /// Returns whether a step is finished, with the recorded output. A step whose output is gone is recorded as not
+    /// finished.
+    ///
+    /// # Errors
+    /// When the output is another one, damaged, longer than the step asks for, or made from other outputs of earlier steps.
+    fn is_finished(&mut self, recipe: &Recipe, (kind, step): (Kind, &Step), folder: &Path) -> Result<bool> {
+        let output = kind.output(folder, &step.name);
+        match self.finished.get(&step.name) {
+            Some(recorded) if output_exists(kind, &output)? => {
+                check_output(kind, &output, recorded)?;
+                if kind == Kind::Collect {
+                    let args = parse(kind, step, &recipe.arguments(kind, step, folder))?;
+                    datasets::find(step, &format!("the dataset {}", output.display()), &output, &args)?;
+                }
+                let (made_from, found) = (self.inputs.get(&step.name), self.inputs_of(recipe, step)?);
+                if made_from.is_some_and(|inputs| *inputs != found) {
+                    let problem = "was made from other outputs of earlier steps than those that are there";
+                    return Err(Error::corrupt(&output, problem, "move it away, to make it again"));
+                }
+                Ok(true)
+            }
+            Some(_) => {
+                self.finished.remove(&step.name);
+                self.write(folder).map(|()| false)
+            }
+            None => Ok(false),
+        }
+    }
+
+    /// Returns the hash of those of the datasets and weights before a step.
+    fn inputs_of(&self, recipe: &Recipe, step: &Step) -> Result<String> {
+        let before = recipe.steps().take_while(|(_, other)| other.name != step.name);
+        let made = before.filter(|(kind, _)| *kind != Kind::Eval).map(|(_, other)| self.finished.get(&other.name));
+        let text = serde_json::to_vec(&made.collect::<Vec<_>>());
+        Ok(manifest::hash(&text.map_err(|error| Error::external("writing the record of a recipe", error))?))
     }
 
     /// Returns the hashes of datasets and weights, with the recorded ones.
@@ -342,9 +442,27 @@ impl State {
         let made = recipe.steps().filter(|(kind, _)| *kind != Kind::Eval);
         let compared = made.filter_map(|(_, step)| {
             let hash = self.finished.get(&step.name)?;
-            let expected = step.hash.as_deref().filter(|_| self.settings.is_empty());
-            Some(Compared { name: &step.name, hash, expected })
+            Some(Compared { name: &step.name, hash, expected: step.hash.as_deref() })
         });
         compared.collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn devices_of_finished_steps_are_not_checked() {
+        let step = "name = \"small\"\nmodel = \"lewm\"\ndata = \"rooms\"\ndevice = \"abacus:0\"";
+        let recipe = Recipe::parse("x", &format!("summary = \"s\"\n[[train]]\n{step}")).expect("a recipe");
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut state = State::default();
+        let check = |state: &State| check_devices(&recipe, folder.path(), state).map_err(|error| error.to_string());
+        assert!(check(&state).is_err_and(|error| error.contains("abacus") && error.contains("'small'")));
+        state.finished.insert("small".to_owned(), String::new());
+        assert!(check(&state).is_err(), "its output is gone");
+        std::fs::create_dir(folder.path().join("small")).expect("an output");
+        assert_eq!(check(&state), Ok(()));
     }
 }

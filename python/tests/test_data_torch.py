@@ -1,6 +1,7 @@
 """Tests of datasets in torch's DataLoader: without workers, and with spawned and forked workers."""
 
 import pickle
+from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from data_helpers import LENGTHS, clips, episode, same, write
 from stable_worldmodel import data
 
 torch = pytest.importorskip("torch")
+# Forked workers pickle their batches in a thread, in which imports of Python before 3.12 may fail: torch's are made here.
+ForkingPickler.dumps(torch.zeros(1))
 
 
 @pytest.fixture(scope="module")

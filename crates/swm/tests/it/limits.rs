@@ -107,7 +107,7 @@ fn run_without_memory_ends_with_an_error() {
     }
 }
 
-/// A running command that gets signals. It is killed after a minute, so that a test ends.
+/// A running command that gets signals. It is killed after five minutes, so that a test ends.
 #[cfg(target_os = "linux")]
 struct Running {
     child: std::process::Child,
@@ -125,7 +125,7 @@ impl Running {
         let (_ended, timeout) = std::sync::mpsc::channel::<()>();
         let id = child.id().to_string();
         std::thread::spawn(move || {
-            if timeout.recv_timeout(std::time::Duration::from_secs(60)) == Err(RecvTimeoutError::Timeout) {
+            if timeout.recv_timeout(std::time::Duration::from_secs(300)) == Err(RecvTimeoutError::Timeout) {
                 let _sent = Command::new("kill").args(["-KILL", &id]).status();
             }
         });

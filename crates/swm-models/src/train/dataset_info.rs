@@ -81,7 +81,7 @@ impl ColumnInfo {
         };
         let given = format!("has a standard deviation of {:.1e} in element {element}", self.std[element]);
         let fix = format!(
-            "values below {:.0e} are treated as constant: multiply {} by a scale when you collect",
+            "up to {:.0e} is treated as constant: multiply {} by a scale when you collect",
             precision::CONSTANT,
             if name == ACTION { "the actions" } else { "the column" }
         );

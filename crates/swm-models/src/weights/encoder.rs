@@ -19,8 +19,8 @@ const PREFIXES: [&str; 4] = ["", "encoder.", "model.encoder.", "backbone."];
 /// the encoder as it is.
 ///
 /// # Errors
-/// When the file cannot be read, holds no encoder of this size, is part of a damaged checkpoint or capsule, or is that of a model here with another part that is not trained
-/// (filters, colours) or other images.
+/// When the file cannot be read, holds no encoder of this size, is part of a damaged checkpoint or capsule, or is that of a model
+/// here with another part that is not trained (filters, colours) or other images.
 pub(crate) fn fill(
     encoder: Backbone,
     (config, images): (&BackboneConfig, &ImageNormalization),

@@ -324,8 +324,8 @@ def test_engine_model_reports_wrong_inputs(twins, infos):
         swm.policy.MPCPolicy(swm.solver.CEMSolver(burn), config=swm.PlanConfig())
     assert swm.policy.MPCPolicy(swm.solver.CEMSolver(burn)).config.action_block == 5
     with pytest.raises(ValueError, match="64"):
-        rooms(image_shape=(32, 32)).evaluate(policy=swm.policy.MPCPolicy(swm.solver.CEMSolver(burn)), episodes=1)
+        rooms(image_shape=(32, 32)).evaluate(policy=swm.policy.MPCPolicy(swm.solver.CEMSolver(burn)), episodes=1, seed=0)
     with pytest.raises(ValueError, match="does not act"):
-        rooms().evaluate(policy=swm.policy.FeedForwardPolicy(burn), episodes=1)
+        rooms().evaluate(policy=swm.policy.FeedForwardPolicy(burn), episodes=1, seed=0)
     with pytest.raises(FileNotFoundError, match="nothing"):
         swm.wm.load("nothing")

@@ -471,8 +471,8 @@ def test_interrupted_evaluation_ends_the_interactive_loop():
     world.reset(seed=0)
     world.step(3)
     for play in (
-        lambda: world.evaluate(episodes=1, policy=Interrupting(), progress=False),
-        lambda: world.collect(writer=swm.data.ReplayBuffer(100), episodes=1, policy=Interrupting(), progress=False),
+        lambda: world.evaluate(episodes=1, seed=0, policy=Interrupting(), progress=False),
+        lambda: world.collect(writer=swm.data.ReplayBuffer(100), episodes=1, seed=0, policy=Interrupting(), progress=False),
     ):
         with pytest.raises(KeyboardInterrupt):
             play()

@@ -3,12 +3,14 @@
 import signal
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
 from data_helpers import LENGTHS, clips, same, write
 
 from stable_worldmodel import data
+from stable_worldmodel.data._tensors import to_numpy
 
 
 @pytest.fixture(scope="module")
@@ -275,6 +277,30 @@ def test_error_of_a_reader_is_raised_by_the_loader(stored):
     assert next(batches)["state"].shape == (4, 1, 2)
     with pytest.raises(RuntimeError, match="the disk is gone"):
         list(batches)
+
+
+def test_stop_iteration_of_a_reader_or_a_transform_does_not_end_the_epoch(stored):
+    path, _ = stored
+
+    class Ended(data.Dataset):
+        column_names = ["state"]
+
+        def _load_slice(self, episode, start, end):
+            return {"state": np.full((end - start, 2), next(iter([] if episode else [0])))}
+
+    def nothing(batch):
+        return next(iter([]))
+
+    for batches in (data.Loader(Ended([6, 6], [0, 6]), 4, shuffle=False, backend="numpy"), loader(path, transform=nothing)):
+        with pytest.raises(RuntimeError, match="StopIteration"):
+            list(batches)
+
+
+def test_values_are_read_while_another_thread_imports_torch(monkeypatch):
+    # A module that is being imported has none of its classes.
+    monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
+    np.testing.assert_array_equal(to_numpy([1.0, 2.0]), [1, 2])
+    np.testing.assert_array_equal(data.ZScoreScaler(np.ones(1), np.ones(1)).transform(np.ones((1, 1))), [[0]])
 
 
 WAITING = """

@@ -265,6 +265,9 @@ def test_a_buffer_keeps_few_samplers():
     np.testing.assert_array_equal(again.sample(3, step=0)["row"], first["row"])
     buffer.clear()
     assert not buffer._samplers
+    for copied in (pickle.loads(pickle.dumps(buffer)), copy.deepcopy(buffer)):
+        with pytest.raises(ValueError, match="must have the buffer's columns"):
+            copied.write_episode({"other": np.zeros(3)})
 
 
 def test_writer_that_suppresses_its_error_collects_nothing_elsewhere(tmp_path, monkeypatch):

@@ -435,9 +435,17 @@ def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, m
     def unreadable(path, **kwargs):
         raise NotImplementedError("the format cannot be read")
 
+    def incomplete(path, **kwargs):
+        raise FileNotFoundError(f"{path}/lengths.npy")
+
     # The user's writer would add to the folder, whatever the mode.
     with pytest.raises(FileExistsError, match="there is a dataset already; continue it"):
         collected(tmp_path / "a.npzs", "error", 1)
+    monkeypatch.setattr(numpy_format, "open_reader", incomplete)
+    with pytest.raises(ValueError, match="does not tell the number of episodes .*lengths.npy.*cannot resume"):
+        collected(tmp_path / "a.npzs", "resume", 9)
+    (tmp_path / "empty.npzs").mkdir()
+    assert collected(tmp_path / "empty.npzs", "resume", 2)["added"] == 2
     monkeypatch.setattr(numpy_format, "open_reader", unreadable)
     with pytest.raises(ValueError, match="does not tell the number of episodes .the format cannot be read., .*cannot resume"):
         collected(tmp_path / "a.npzs", "resume", 9)

@@ -428,6 +428,74 @@ def test_pickled_code_of_weights_does_not_run(home, tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "kind"),
+    [
+        ("config.json", b"[" * 100_000, ValueError),
+        ("config.json", b"[" * 900 + b"]" * 900, ValueError),
+        ("config.json", b"{", ValueError),
+        ("config.json", b'{"\xff": 1}', ValueError),
+        ("config.json", b'{"_target_": "torch.nn.Linear", "in_features": "4", "out_features": 3}', ValueError),
+        ("config.json", b'{"_target_": "torch.nn.Linear", "in_features": -4, "out_features": 3}', ValueError),
+        ("config.json", b'{"_target_": "torch.nn.Linear"}', ValueError),
+        ("config.json", b'{"_target_": "os.system"}', ValueError),
+        ("weights.pt", b"", RuntimeError),
+        ("weights.pt", b"not weights", RuntimeError),
+        ("weights.pt", b"PK\x03\x04", RuntimeError),
+    ],
+)
+def test_errors_of_damaged_files_name_the_file(tmp_path, name, content, kind):
+    config = {"_target_": "torch.nn.Linear", "in_features": 4, "out_features": 3}
+    save_pretrained(torch.nn.Linear(4, 3), "linear", config, cache_dir=tmp_path)
+    file = tmp_path / "checkpoints" / "linear" / name
+    file.write_bytes(content)
+    with warnings.catch_warnings(), pytest.raises(kind) as raised:
+        # Changed configurations are warned of.
+        warnings.simplefilter("ignore")
+        load_pretrained(file.parent)
+    assert str(raised.value).startswith(f"{file}: ") and not isinstance(raised.value, RecursionError)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"{",
+        b"[]",
+        b"\xff\xff",
+        b"[" * 100_000,
+        b'{"x": 1}',
+        b'{"x": {}}',
+        b'{"x": {"dtype": [], "shape": [1], "data_offsets": [0, 4]}}',
+        b'{"x": {"dtype": "F32", "shape": [3], "data_offsets": [0, 4]}}',
+        b'{"x": {"dtype": "F32", "shape": "3", "data_offsets": [0, 4]}}',
+        b'{"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 3]}}',
+        b'{"x": {"dtype": "F32", "shape": [1], "data_offsets": [0.0, 4]}}',
+        b'{"x": {"dtype": "F32", "shape": [100000000000000000000], "data_offsets": [0, 4]}}',
+        b'{"__metadata__": 3}',
+        b'{"__metadata__": {"swm_capsule": "{"}}',
+    ],
+)
+def test_errors_of_damaged_safetensors_name_the_file(tmp_path, header):
+    file = tmp_path / "weights.safetensors"
+    file.write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
+    is_capsule = b"swm_capsule" in header
+    with pytest.raises(RuntimeError) as raised:
+        _weights.read_capsule(file) if is_capsule else _weights.read_state_dict(file)
+    assert str(raised.value).startswith(f"{file}: ") and not isinstance(raised.value, RecursionError)
+
+
+def test_lack_of_memory_is_not_called_damage(home, monkeypatch):
+    save_pretrained(torch.nn.Linear(4, 3), "linear", {"_target_": "torch.nn.Linear", "in_features": 4, "out_features": 3})
+
+    def fail(*_, **__):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4 bytes")
+
+    for module, name in ((torch, "load"), (torch.nn.init, "kaiming_uniform_")):
+        with monkeypatch.context() as changed, pytest.raises(RuntimeError, match="^DefaultCPUAllocator"):
+            changed.setattr(module, name, fail)
+            load_pretrained("linear")
+
+
 def test_other_objects_in_weights_are_named(home):
     folder = home / "checkpoints/run"
     folder.mkdir(parents=True)

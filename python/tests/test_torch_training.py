@@ -139,6 +139,22 @@ def test_a_training_equals_that_of_the_engine(family, settings, rooms, swings, t
     assert swm.wm.load(str(tmp_path / "torch")).card["family"] == family
 
 
+@pytest.mark.parametrize("family", ["lewm", "pldm", "gciql", "dino_wm", "tdmpc2"])
+def test_float64_columns_train_as_their_float32_values(family, rooms, swings, tmp_path):
+    narrow, wide = swings if family == "tdmpc2" else rooms, str(tmp_path / "wide.lance")
+    dataset = swm.data.load_dataset(narrow)
+    names = ["pixels", "action", "state", "reward", "terminated"]
+    with swm.data.open_writer(wide) as writer:
+        for number in range(len(dataset.lengths)):
+            content = {name: np.asarray(values) for name, values in dataset.load_episode(number).items() if name in names}
+            floats = {name: values.astype(np.float64) for name, values in content.items() if values.dtype == np.float32}
+            assert "action" in floats
+            writer.write_episode({**content, **floats})
+    for name, data in [("narrow", narrow), ("wide", wide)]:
+        torch_train(family, data, tmp_path / name, SHORT)
+    assert_close(weights(tmp_path / "wide"), weights(tmp_path / "narrow"), 1e-6)
+
+
 @pytest.mark.parametrize(("steps", "entropy"), [(40, 0.0), (1, 1.0)])
 def test_the_policy_of_tdmpc2_gets_the_engines_gradient(steps, entropy, swings, tmp_path):
     # The noise of actions is drawn differently: values depend little on it, and so do entropies of a new policy.

@@ -6,6 +6,7 @@
 //! - [`check_free`] and [`check_own`] refuse to replace a file that the program did not write.
 //! - [`delete_named`] removes regular files of a folder by their exact names, [`delete`] by the patterns of names that only
 //!   the program gives, and nothing else. [`move_named`] moves them.
+//! - [`exists`] and [`entries`] tell what is missing from what may not be read.
 //! - [`Lock`] keeps a second writer away from a file or folder.
 
 mod lock;
@@ -176,13 +177,45 @@ pub fn check_no_link(path: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Whether something exists at a path. Links are followed.
+///
+/// # Errors
+/// When that is unknown, such as in a folder that may not be read.
+pub fn exists(path: &Path) -> Result<bool> {
+    match std::fs::metadata(path) {
+        Ok(_) => Ok(true),
+        Err(error) if is_missing(&error) => Ok(false),
+        Err(error) => Err(Error::io(path, "examining the path", error)),
+    }
+}
+
+/// The paths of what a folder holds, sorted; none if there is no such folder.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
+    let io = |error| Error::io(folder, "listing the folder", error);
+    let found = match std::fs::read_dir(folder) {
+        Err(error) if is_missing(&error) => return Ok(vec![]),
+        found => found.map_err(io)?,
+    };
+    let mut paths = found.map(|entry| Ok(entry.map_err(io)?.path())).collect::<Result<Vec<_>>>()?;
+    paths.sort();
+    Ok(paths)
+}
+
+/// Whether an error says that nothing exists at a path.
+fn is_missing(error: &std::io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
+}
+
 /// Returns the type of what a path names, without following a link at its end; `None` if nothing exists.
 fn kind(path: &Path) -> Result<Option<FileType>> {
     // Without the slash at the end of a path, which would follow a link.
     let path: PathBuf = path.components().collect();
     match std::fs::symlink_metadata(&path) {
         Ok(found) => Ok(Some(found.file_type())),
-        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(None),
+        Err(error) if is_missing(&error) => Ok(None),
         Err(error) => Err(Error::io(path, "examining the path", error)),
     }
 }

@@ -14,8 +14,8 @@
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
 //!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files. [`home`]: the home
 //!    folder. [`text`]: text from files, made safe to print. [`origin`]: names that only the user may choose.
-//!    [`finite`]: counts of NaN and infinite values. [`limits`]: the largest counts that
-//!    commands accept.
+//!    [`finite`]: counts of NaN and infinite values. [`guarded`]: calls of libraries that may panic. [`limits`]: the
+//!    largest counts that commands accept.
 
 pub mod batch;
 pub mod camera_view;
@@ -27,6 +27,7 @@ pub mod error;
 pub mod factors;
 pub mod files;
 pub mod finite;
+pub mod guarded;
 pub mod home;
 pub mod key;
 pub mod limits;

@@ -198,20 +198,11 @@ impl ReplayPolicy {
         check_actions(spec, &read.schema().columns()[0])?;
         let (mut by_key, mut row) = (HashMap::new(), 0);
         for (episode, range) in episodes.into_iter().zip(&ranges) {
-            let actions = (row..row + range.length).map(|row| values(&read, row)).collect();
+            let actions: Result<_> = (row..row + range.length).map(|row| read.row(row).to_f64(ACTION)).collect();
             row += range.length;
-            by_key.insert(starts.key(episode), actions);
+            by_key.insert(starts.key(episode), actions?);
         }
         Ok(Self { recorded: by_key, no_op: no_op(spec), slots: vec![(Key::new(0), 0); slots] })
-    }
-}
-
-/// The action in a row, in the type of its column.
-fn values(read: &Batch, row: usize) -> Vec<f64> {
-    match read.schema().columns()[0].dtype {
-        DType::Float32 => read.row(row).at::<f32>(0).iter().map(|&value| value.into()).collect(),
-        DType::Float64 => read.row(row).at::<f64>(0).to_vec(),
-        _ => read.row(row).at::<i64>(0).iter().map(|&value| value as f64).collect(),
     }
 }
 

@@ -8,7 +8,7 @@
 use crate::starts::Starts;
 use swm_core::columns::{ACTION, SUCCESS};
 use swm_core::results::{Prediction, Run, Trajectory};
-use swm_core::{Batch, DType, Error, Result};
+use swm_core::{Batch, Error, Result};
 use swm_data::{Reader, StepRange};
 
 pub use swm_core::Predictor;
@@ -169,13 +169,7 @@ fn read(
     }
     let names: Vec<&str> = columns.iter().map(String::as_str).collect();
     let rows = reader.read(&names, &frames)?;
-    let actions = reader.read(&[ACTION], &between)?;
-    let actions = match actions.schema().columns()[0].dtype {
-        DType::Float32 => actions.get::<f32>(ACTION)?.to_vec(),
-        // Choices are small integers, which float32 represents exactly.
-        _ => actions.get::<i64>(ACTION)?.iter().map(|&choice| choice as f32).collect(),
-    };
-    Ok((rows, actions))
+    Ok((rows, reader.read(&[ACTION], &between)?.to_f32(ACTION)?))
 }
 
 /// The mean squared error of a predicted latent, both `[latent]`.

@@ -11,7 +11,7 @@ pub const SIDE: usize = 224;
 /// The start of an episode, and the size of its frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Still {
-    /// The seed of the reset: the `episode_seed` of a dataset.
+    /// The seed of the reset, which a dataset has in the elements of `episode_seed` (docs/data.md).
     pub seed: u64,
     /// Factors to sample and to pin.
     pub variation: VariationRequest,

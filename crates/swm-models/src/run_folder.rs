@@ -112,9 +112,10 @@ pub(crate) fn remove_saved_data(folder: &Path) -> Result<()> {
 /// that remain; the folder is removed if none remain.
 ///
 /// # Errors
-/// When the folder is a symbolic link, a training writes to it, or a file cannot be removed.
+/// When the folder or one of a checkpoint in it is a symbolic link, a training writes to it, or a file cannot be removed.
 pub fn remove(run: &Path) -> Result<Vec<PathBuf>> {
-    files::check_no_link(run)?;
+    // What is behind a link stays.
+    CHECKPOINT_FOLDERS.iter().try_for_each(|folder| files::check_no_link(&run.join(folder)))?;
     let _lock = Lock::folder(run)?;
     let checkpoints = CHECKPOINT_FOLDERS
         .iter()

@@ -40,6 +40,34 @@ pub fn load() -> Result<()> {
     LOADED.run(open)
 }
 
+/// Loads MuJoCo to compile a model, for which MuJoCo may take `bytes` of memory.
+///
+/// # Errors
+/// As [`load`] and [`check_memory`].
+pub(crate) fn load_to_compile(bytes: usize) -> Result<()> {
+    load()?;
+    check_memory("compiling a model", bytes)
+}
+
+/// Checks that the system has memory for what MuJoCo is about to do. Where an allocation of its own fails, MuJoCo ends the process.
+/// Threads that ask at once may be told of the same memory.
+///
+/// # Errors
+/// When the system refuses `bytes`.
+pub(crate) fn check_memory(doing: &str, bytes: usize) -> Result<()> {
+    let (access, kind) = (libc::PROT_READ | libc::PROT_WRITE, libc::MAP_PRIVATE | libc::MAP_ANONYMOUS);
+    // SAFETY: a new mapping, at an address that the system chooses, overlaps nothing; it is removed below, and never used.
+    let mapped = unsafe { libc::mmap(std::ptr::null_mut(), bytes, access, kind | libc::MAP_NORESERVE, -1, 0) };
+    if mapped == libc::MAP_FAILED {
+        let needed = bytes >> 20;
+        let problem = format!("out of memory: MuJoCo may take {needed} MiB; raise the limit of memory (`ulimit -v`)");
+        return Err(Error::external(doing, problem));
+    }
+    // SAFETY: the mapping has this address and length.
+    unsafe { libc::munmap(mapped, bytes) };
+    Ok(())
+}
+
 /// Opens the library, fills the table, and installs the log handler.
 fn open() -> Result<()> {
     let path = assets::path("mujoco")?.join(format!("mujoco/libmujoco.so.{VERSION}"));

@@ -93,9 +93,19 @@ fn open_library((library, version): (&str, c_int)) -> Result<Library> {
     let file = format!("lib{library}.so.{version}");
     // SAFETY: FFmpeg's libraries have no initialisers with side effects; where they are found is up to the user's system.
     unsafe { Library::open(Some(&file), RTLD_NOW | RTLD_LOCAL) }.map_err(|error| {
-        let problem = format!("{}; install FFmpeg's libraries of this version", reason(&error));
-        Error::external(format!("loading {file} for a video"), problem)
+        let problem = reason(&error);
+        let fix = advice(&problem);
+        Error::external(format!("loading {file} for a video"), format!("{problem}; {fix}"))
     })
+}
+
+/// What to do about a library that cannot be loaded. One that is there may lack file handles or memory.
+fn advice(problem: &str) -> &'static str {
+    match problem {
+        _ if problem.contains("Too many open files") => "raise the limit of open files",
+        _ if problem.contains("Cannot allocate memory") => "raise the limit of memory",
+        _ => "install FFmpeg's libraries of this version",
+    }
 }
 
 #[cfg(test)]
@@ -108,6 +118,8 @@ mod tests {
         for part in ["libswm-missing.so.1 for a video", "No such file", "install FFmpeg's libraries"] {
             assert!(error.contains(part), "{error}");
         }
+        assert_eq!(advice("libx.so: Too many open files"), "raise the limit of open files");
+        assert_eq!(advice("libx.so: Cannot allocate memory"), "raise the limit of memory");
     }
 
     #[test]

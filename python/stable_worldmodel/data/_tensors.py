@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from stable_worldmodel import _options
+from stable_worldmodel import _options, _torch
 
 Array = npt.NDArray[Any]
 Backend = Literal["torch", "numpy"]
@@ -71,7 +70,7 @@ def channels_first(array: Array, shape: tuple[int, ...]) -> Array:
 
 def to_numpy(value: Any) -> Array:
     """A tensor, a list of tensors, or any array-like value as an array."""
-    torch = sys.modules.get("torch")
+    torch = _torch.loaded()
     if torch is not None:
         if isinstance(value, torch.Tensor):
             return _from_torch(value)

@@ -166,6 +166,9 @@ class ReplayBuffer(Dataset):
         episodes = state.pop("_episodes")
         self.__dict__.update(state)
         self._lock, self._samplers = fork_lock(), OrderedDict()
+        if self._columns:
+            # A buffer that was cleared has no episodes, and keeps its columns.
+            self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
         self._refresh()
         filter, self.key_filter = self.key_filter, None
         self.write_episodes(episodes)

@@ -198,16 +198,20 @@ def foreign_episodes(path: str | os.PathLike[str], format: str | None, mode: str
     text = os.fspath(path)
     try:
         return len(kind.open_reader(path).lengths)
-    except FileNotFoundError:
-        return 0
     except Exception as error:
-        if "://" not in text and not os.path.exists(text):
+        # A dataset that is there may lack a file of its own.
+        if isinstance(error, FileNotFoundError) if "://" in text else _is_free(text):
             return 0
         why = f"{text}: the reader of the format {kind.name!r} does not tell the number of episodes ({error})"
         if mode == "resume":
             raise ValueError(f"{why}, so the collection cannot resume; use mode='append' or mode='overwrite'") from error
         warnings.warn(f"{why}, so the collection starts again with its first episode; use another seed", stacklevel=3)
         return 0
+
+
+def _is_free(path: str) -> bool:
+    """Whether a local path has nothing, or an empty folder."""
+    return not os.path.exists(path) or (os.path.isdir(path) and not os.listdir(path))
 
 
 def _foreign(path: str | os.PathLike[str], format: str | None) -> type[Format] | None:

@@ -305,13 +305,26 @@ class Loader:
         return self._batches(epoch, batch)
 
     def _batches(self, epoch: int, batch: int) -> Iterator[dict[str, Any]]:
-        shaped = map(self._shaped, iter(self._loader.epoch(epoch, batch).next, None))
+        shaped = self._read(epoch, batch)
         # Page-locked memory is filled while the batch before is used. A transform runs in the thread of its user.
         plain = self.transform is None and not self._has_own
         for value in _ahead(shaped) if self.pin_memory and self.device is not None and plain else shaped:
             batch += 1
             self._at = (epoch, batch) if batch < len(self) else (epoch + 1, 0)
             yield value
+
+    def _read(self, epoch: int, batch: int) -> Iterator[dict[str, Any]]:
+        """The batches of an epoch as the engine reads them, with their shapes and transforms."""
+        batches = self._loader.epoch(epoch, batch)
+        try:
+            while (found := batches.next()) is not None:
+                yield self._shaped(found)
+        except StopIteration as error:
+            # Python would take it for the end of the epoch.
+            raise RuntimeError(
+                "Loader: the reader of the dataset, or a transform, raised StopIteration, as next(...) without a default does; "
+                "give next a default, or raise another exception"
+            ) from error
 
     def _shaped(self, found: dict[str, Array]) -> dict[str, Any]:
         batch: dict[str, Any] = {}

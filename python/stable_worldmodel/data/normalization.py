@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any, TypeVar
 
 import numpy as np
 
+from .. import _torch
 from . import _tensors
 from ._tensors import Array
 
@@ -16,7 +16,7 @@ Values = TypeVar("Values")
 
 
 def _is_tensor(value: Any) -> bool:
-    torch = sys.modules.get("torch")
+    torch = _torch.loaded()
     return torch is not None and isinstance(value, torch.Tensor)
 
 

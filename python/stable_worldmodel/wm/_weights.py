@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pickle
 import re
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 
 from .pretrained import stored_names
 
-__all__ = ["check_archive", "check_numbers", "load_into", "read_capsule", "read_safetensors", "read_state_dict"]
+__all__ = ["check_archive", "check_numbers", "lacks_memory", "load_into", "read_capsule", "read_safetensors", "read_state_dict"]
 
 _TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "u1", "BOOL": "?"}
 #: The types of weights in which NaN are looked for.
@@ -39,7 +40,11 @@ _NEWER = (
 
 
 def read_safetensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """The tensors of a safetensors file."""
+    """The tensors of a safetensors file.
+
+    Raises:
+        RuntimeError: If the file is damaged.
+    """
     return _read(path)[0]
 
 
@@ -47,34 +52,50 @@ def read_capsule(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str
     """The document of a capsule of the engine, and its weights in single precision.
 
     Raises:
-        RuntimeError: If the file is no capsule.
+        RuntimeError: If the file is no capsule, or damaged.
     """
     tensors, metadata = _read(path)
     if "swm_capsule" not in metadata:
         raise RuntimeError(f"{path}: it is no capsule; expected a file that `swm checkpoints pack` wrote")
-    return json.loads(metadata["swm_capsule"]), {name: value.float() for name, value in tensors.items() if "/" not in name}
+    with _damage(path):
+        document = json.loads(metadata["swm_capsule"])
+    return document, {name: value.float() for name, value in tensors.items() if "/" not in name}
+
+
+def lacks_memory(error: Exception) -> bool:
+    """Whether an error says that there is too little memory; torch has no type of its own for that of the CPU."""
+    return isinstance(error, MemoryError) or bool(re.search("(?i)out of memory|allocate memory", str(error)))
+
+
+@contextlib.contextmanager
+def _damage(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Raises what the content of a damaged file leads to as a `RuntimeError` that names the file."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        problem = f"{type(error).__name__}: {error}"
+        raise RuntimeError(f"{path}: it is damaged ({problem}); get it again from where it comes from") from error
 
 
 def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and the metadata of a safetensors file."""
     _check_not_sparse(path)
-    with open(path, "rb") as file:
+    with open(path, "rb") as file, _damage(path):
         size = os.fstat(file.fileno()).st_size
         (length,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
         if not 0 < length <= min(_MAX_HEADER, size - 8):
             raise RuntimeError(f"{path}: not a safetensors file")
         header = json.loads(file.read(length))
         data = file.read()
-    found = {}
-    for name, entry in header.items():
-        if name == "__metadata__":
-            continue
-        begin, end = entry["data_offsets"]
-        if entry["dtype"] not in _TYPES or not 0 <= begin <= end <= len(data):
-            raise RuntimeError(f"{path}: the tensor {name!r} is damaged or of an unknown type")
-        values = np.frombuffer(data[begin:end], np.dtype(_TYPES[entry["dtype"]])).reshape(entry["shape"])
-        found[name] = torch.from_numpy(values.copy())
-    return found, header.get("__metadata__") or {}
+        metadata = dict(header.pop("__metadata__", None) or {})
+        found = {}
+        for name, entry in header.items():
+            begin, end = entry["data_offsets"]
+            if entry["dtype"] not in _TYPES or not 0 <= begin <= end <= len(data):
+                raise RuntimeError(f"{path}: the tensor {name!r} is damaged or of an unknown type")
+            values = np.frombuffer(data[begin:end], np.dtype(_TYPES[entry["dtype"]])).reshape(entry["shape"])
+            found[name] = torch.from_numpy(values.copy())
+    return found, metadata
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -89,14 +110,20 @@ def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     check_archive(path)
     try:
         found: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        named = re.search(r"GLOBAL (\S+)", str(error))
-        if named is None:
+    except Exception as error:
+        if isinstance(error, OSError) or lacks_memory(error):
             raise
-        # What torch says to do here would run code of the file.
+        named = re.search(r"GLOBAL (\S+)", str(error)) if isinstance(error, pickle.UnpicklingError) else None
+        if named is not None:
+            # What torch says to do here would run code of the file.
+            raise RuntimeError(
+                f"{path}: it holds objects of {named[1]!r}, and only tensors, numbers and texts are read (weights_only); save "
+                "its state dict alone, or import it with `swm checkpoints import`"
+            ) from error
+        # For damage torch raises errors of many types, and few of them name the file.
+        reason = str(error).rpartition("WeightsUnpickler error: ")[2].strip().partition("\n")[0]
         raise RuntimeError(
-            f"{path}: it holds objects of {named[1]!r}, and only tensors, numbers and texts are read (weights_only); save its "
-            "state dict alone, or import it with `swm checkpoints import`"
+            f"{path}: torch cannot load it ({reason or type(error).__name__}); expected a whole file that torch.save wrote"
         ) from error
     if isinstance(found, Mapping) and isinstance(found.get("state_dict"), Mapping):
         found = found["state_dict"]

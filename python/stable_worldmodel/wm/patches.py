@@ -63,7 +63,7 @@ class PatchEncoder(Pretrained):
         if column not in self.scales:
             return values.float()
         mean, std = (part.to(values.device) for part in self.scales[column])
-        return ((values.double() - mean) / std).nan_to_num().float()
+        return ((values.float().double() - mean) / std).nan_to_num().float()
 
     def _encoded(self, images: Tensor) -> Any:
         interpolation = {"interpolate_pos_encoding": True} if self.interpolate_pos_encoding else {}

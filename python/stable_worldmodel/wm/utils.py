@@ -22,7 +22,7 @@ from .. import _engine, _files
 from ._bounds import bounded
 from ._build import build
 from ._located import home_of, is_stored, located
-from ._weights import check_numbers, load_into, read_state_dict
+from ._weights import check_numbers, lacks_memory, load_into, read_state_dict
 from .checkpoints import module_of
 
 __all__ = ["load_pretrained", "save_pretrained"]
@@ -183,6 +183,12 @@ def load_pretrained(
         cache_dir: A folder in place of `$STABLEWM_HOME`, whose names count before paths.
         extra_args: Values of the configuration to replace, by dot key.
         trust: Whether a `_target_` may name any function, which is imported and called.
+
+    Raises:
+        FileNotFoundError: If there is no such checkpoint, or the file `config.json` is missing.
+        ValueError: If the configuration is damaged, or describes no model that may be built; the error names the file.
+        RuntimeError: If the weights are damaged or do not fit the model, or there is too little memory. With `trust`, errors of
+            the model's construction keep their types.
     """
     path = _existing(str(name), cache_dir)
     if is_stored(path):
@@ -197,7 +203,7 @@ def load_pretrained(
     # Another process may replace both files.
     with _files.locked(file.parent, exclusive=False):
         text, weights, mark = _read_settings(settings), read_state_dict(file), _mark(file)
-        config = json.loads(text)
+        config = _parsed(text, settings)
         if mark is not None and mark.get("config") != _hash(text):
             saved = "without a configuration" if mark.get("config") is None else "with another configuration"
             warnings.warn(f"{file} was saved {saved}; {settings} may describe another model", stacklevel=2)
@@ -207,7 +213,16 @@ def load_pretrained(
         for group in groups:
             part = part.setdefault(group, {})
         part[last] = value
-    model = build(config, trust=True) if trust else _built(config, file.stat().st_size, len(weights))
+    if trust:
+        model = build(config, trust=True)
+    else:
+        try:
+            model = _built(config, file.stat().st_size, len(weights))
+        except (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            if lacks_memory(error):
+                raise
+            # Torch and the modules complain of arguments in errors of many types, and know no file.
+            raise ValueError(f"{settings}: {error or type(error).__name__}") from error
     if not isinstance(model, nn.Module):
         raise ValueError(f"{settings}: it describes no torch module; expected a _target_ and its arguments")
     check_numbers(weights, str(file))
@@ -222,6 +237,14 @@ def _read_settings(path: Path) -> bytes:
     if len(text) > _MOST_SETTINGS:
         raise ValueError(f"{path}: it has more than {_MOST_SETTINGS} bytes; expected the configuration of a model")
     return text
+
+
+def _parsed(text: bytes, path: Path) -> Any:
+    """The configuration that a file has as JSON."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: it is no JSON ({error}); expected the configuration of a model") from error
 
 
 def _built(config: Any, stored_bytes: int, stored_tensors: int) -> Any:

@@ -15,7 +15,6 @@ import math
 import os
 import random
 import re
-import sys
 import types
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +22,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Space
+
+from .. import _torch
 
 __all__ = ["Unrecorded", "described", "flat", "is_of_package", "modules_hash", "named", "qualified", "short"]
 
@@ -113,7 +114,7 @@ def _array(value: Any, inner: Callable[[Any], Any]) -> Any:
 
 
 def _is_tensor(value: Any) -> bool:
-    torch = sys.modules.get("torch")
+    torch = _torch.loaded()
     return torch is not None and bool(torch.is_tensor(value))
 
 
@@ -163,7 +164,7 @@ def _code(code: types.CodeType) -> str:
 
 def _object(value: Any, inner: Callable[[Any], Any]) -> Any:
     """An object by its class and its attributes, or by its `repr` if that has no address in memory."""
-    torch = sys.modules.get("torch")
+    torch = _torch.loaded()
     # Open files and sockets have a number of this process; the state of a generator is not in its attributes.
     if isinstance(value, (io.IOBase, random.Random)) or hasattr(type(value), "fileno"):
         raise Unrecorded(f"{type(value).__name__} has a state that is not equal in another process")
@@ -255,7 +256,7 @@ def modules_hash(given: Any) -> str | None:
     Raises:
         Unrecorded: When the weights cannot be read.
     """
-    torch = sys.modules.get("torch")
+    torch = _torch.loaded()
     modules = [] if torch is None else list(_modules(given, torch))
     if not modules:
         return None

@@ -130,14 +130,7 @@ impl Batch {
     /// When there is no such column.
     pub fn to_f32(&self, name: &str) -> Result<Vec<f32>> {
         let index = self.schema.index(name)?;
-        let bytes = self.bytes(index);
-        Ok(match self.schema.columns()[index].dtype {
-            DType::Bool | DType::U8 => bytes.iter().map(|&v| f32::from(v)).collect(),
-            DType::Int32 => bytemuck::cast_slice::<u8, i32>(bytes).iter().map(|&v| v as f32).collect(),
-            DType::Int64 => bytemuck::cast_slice::<u8, i64>(bytes).iter().map(|&v| v as f32).collect(),
-            DType::Float32 => bytemuck::cast_slice(bytes).to_vec(),
-            DType::Float64 => bytemuck::cast_slice::<u8, f64>(bytes).iter().map(|&v| v as f32).collect(),
-        })
+        Ok(to_f32(self.schema.columns()[index].dtype, self.bytes(index)))
     }
 
     /// One row.
@@ -275,6 +268,17 @@ impl Schema {
             ));
         }
         Ok(())
+    }
+}
+
+/// Converts elements of any type to `f32`.
+fn to_f32(dtype: DType, bytes: &[u8]) -> Vec<f32> {
+    match dtype {
+        DType::Bool | DType::U8 => bytes.iter().map(|&v| f32::from(v)).collect(),
+        DType::Int32 => bytemuck::cast_slice::<u8, i32>(bytes).iter().map(|&v| v as f32).collect(),
+        DType::Int64 => bytemuck::cast_slice::<u8, i64>(bytes).iter().map(|&v| v as f32).collect(),
+        DType::Float32 => bytemuck::cast_slice(bytes).to_vec(),
+        DType::Float64 => bytemuck::cast_slice::<u8, f64>(bytes).iter().map(|&v| v as f32).collect(),
     }
 }
 

@@ -64,6 +64,15 @@ impl<'a> RowRef<'a> {
         })
     }
 
+    /// The elements of a column of any type, converted to `f32` as by [`Batch::to_f32`]: `[shape…]`.
+    ///
+    /// # Errors
+    /// When the batch has no such column.
+    pub fn to_f32(self, name: &str) -> Result<Vec<f32>> {
+        let index = self.schema().index(name)?;
+        Ok(super::to_f32(self.schema().columns()[index].dtype, self.bytes(index)))
+    }
+
     /// The bytes of column `index`, of any type.
     pub fn bytes(self, index: usize) -> &'a [u8] {
         let n = self.schema().columns()[index].row_bytes();

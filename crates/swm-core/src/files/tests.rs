@@ -104,3 +104,21 @@ fn outputs_without_permission_to_read_are_called_so() {
     }
     fs::remove_dir_all(&root).expect("removing the folder of the test");
 }
+
+#[test]
+fn missing_is_told_from_what_cannot_be_read() {
+    let root = folder("exists");
+    fs::write(root.join("file"), "").expect("writing a file");
+    std::os::unix::fs::symlink(root.join("loop"), root.join("loop")).expect("making a link");
+    for (name, exists_there) in
+        [("", true), ("file", true), ("none", false), ("none/below", false), ("file/below", false)]
+    {
+        assert_eq!(exists(&root.join(name)).expect("known"), exists_there, "{name}");
+    }
+    assert_eq!(entries(&root).expect("listing"), ["file", "loop"].map(|name| root.join(name)));
+    assert_eq!(["none", "file"].map(|name| entries(&root.join(name)).expect("no folder").len()), [0, 0]);
+    for error in [exists(&root.join("loop/below")).map(drop), entries(&root.join("loop")).map(drop)] {
+        assert!(matches!(error, Err(Error::Io { .. })), "{error:?}");
+    }
+    fs::remove_dir_all(&root).expect("removing the folder of the test");
+}

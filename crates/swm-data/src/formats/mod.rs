@@ -7,8 +7,6 @@ mod cast;
 mod column_files;
 pub mod entry;
 mod folder;
-#[cfg(any(feature = "hdf5", feature = "lerobot"))]
-mod guarded;
 mod hdf5;
 pub mod lance;
 mod lance_video;
@@ -19,6 +17,7 @@ mod replacing;
 mod set_aside;
 #[cfg_attr(not(feature = "hdf5"), allow(dead_code, reason = "npz files use only a part of this module"))]
 mod stored_scalar;
+mod system_error;
 mod video;
 
 pub use entry::{Backend, FormatEntry};

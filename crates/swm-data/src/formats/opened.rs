@@ -6,7 +6,7 @@ use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// A dataset of column files that is open. Its reader opens files by name when they are needed, and another process may
 /// replace the dataset in between: columns that were read before would stand beside those of the other one.
@@ -55,7 +55,7 @@ pub fn replaced(path: &Path) -> Error {
 
 /// The error of reading videos, which are opened again for every read: that of a video that is missing, if one is.
 pub fn or_missing<'a>(error: Error, mut videos: impl Iterator<Item = Cow<'a, Path>>) -> Error {
-    match videos.find(|path| !path.exists()) {
+    match videos.find(|path| files::exists(path).is_ok_and(|exists| !exists)) {
         Some(path) => Error::corrupt(path, "the video is missing", "move it back, or restore it from a copy"),
         None => error,
     }

@@ -4,7 +4,7 @@ use super::entry::FormatEntry;
 use super::{folder, hdf5, lance, lance_video, lerobot, set_aside, video};
 use crate::dataset::{Location, Reader, WriteOptions, Writer};
 use std::sync::Arc;
-use swm_core::{Error, Named, Registry, Result, Schema};
+use swm_core::{Error, Named, Registry, Result, Schema, files};
 
 /// All dataset formats. The suffix of a location determines its format; without a suffix, the first format that detects it.
 pub static FORMATS: Registry<FormatEntry> = Registry {
@@ -39,9 +39,15 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     if let Some(error) = interrupted(&location) {
         return Err(error);
     }
-    let problem = match location.path().map(|path| path.try_exists()) {
-        Some(Ok(false)) => "there is no such dataset",
-        _ => "it is not a dataset",
+    let problem = match location.path() {
+        Some(path) if !files::exists(path)? => "there is no such dataset",
+        Some(path) => {
+            // A folder that may not be read may be a dataset.
+            let listed = std::fs::read_dir(path).map(drop);
+            listed.map_err(|error| Error::io(path, "listing the folder", error))?;
+            "it is not a dataset"
+        }
+        None => "it is not a dataset",
     };
     let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
     let fix = format!("`swm formats` describes the formats: {}", known.join(", "));

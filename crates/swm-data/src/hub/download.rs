@@ -162,12 +162,11 @@ impl Hub {
         verified: &mut Verified,
         control: &mut Control<'_>,
     ) -> Result<u64> {
-        let snapshot = folder.snapshot(&pinned.revision);
         let (name, total, mut downloaded) = (pinned.at("main").to_string(), missing.len(), 0);
         control.emit(Event::Started(Stage { name: STAGE, subject: &[&name], total, unit: "files" }));
         for (done, file) in missing.into_iter().enumerate() {
             let fetched = self.fetch(pinned, file, folder, control);
-            let (transferred, stamp) = fetched.map_err(|error| with_old_file(error, &snapshot.join(&file.path)))?;
+            let (transferred, stamp) = fetched.map_err(|error| with_old_file(error, file, folder, &pinned.revision))?;
             verified.add(file, stamp);
             downloaded += transferred;
             control.progress(Progress { stage: STAGE, done: done + 1, total, unit: "files", metrics: &[] });
@@ -228,36 +227,45 @@ impl Hub {
         }
         let stamp = Stamp::at(&part).filter(|_| file.is_hashed());
         check_hash(&part, &url, file, control)?;
-        set_aside(&path, control)?;
+        set_aside(&path, || changed_name(file, folder, &pinned.revision), control)?;
         std::fs::rename(&part, &path).map_err(|error| Error::io(&path, "saving a download", error))?;
         Ok((transferred, stamp))
     }
 }
 
-/// The path that a file gets which is replaced by a download.
-fn changed_name(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".changed");
-    name.into()
+/// The path that a file gets which is replaced by a download: one that nothing has, and that no file of the commit will have.
+fn changed_name(file: &HubFile, folder: &Folder, commit: &str) -> PathBuf {
+    let (snapshot, listed) = (folder.snapshot(commit), folder.known_files(commit).unwrap_or_default());
+    let mut name = format!("{}.changed", file.path);
+    for number in 2.. {
+        let is_listed = listed.iter().any(|file| file.path == name || file.path.starts_with(&format!("{name}/")));
+        if !is_listed && std::fs::symlink_metadata(snapshot.join(&name)).is_err() {
+            break;
+        }
+        name = format!("{}.changed-{number}", file.path);
+    }
+    snapshot.join(name)
 }
 
-/// Keeps a file that a download replaces, because the user may have edited it.
-fn set_aside(path: &Path, control: &mut Control<'_>) -> Result<()> {
+/// Keeps a file that a download replaces, because the user may have edited it. `name` gives its new path.
+fn set_aside(path: &Path, name: impl FnOnce() -> PathBuf, control: &mut Control<'_>) -> Result<()> {
     if !std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_dir()) {
         return Ok(());
     }
-    let kept = changed_name(path);
+    let kept = name();
     std::fs::rename(path, &kept).map_err(|error| Error::io(&kept, "keeping the old file", error))?;
     control.emit(Event::Log(&format!("{} is the file that the download replaces", kept.display())));
     Ok(())
 }
 
 /// The error of a download, which names the file that it would replace.
-fn with_old_file(error: Error, path: &Path) -> Error {
+fn with_old_file(error: Error, file: &HubFile, folder: &Folder, commit: &str) -> Error {
+    let path = folder.snapshot(commit).join(&file.path);
     if !matches!(error, Error::External { .. }) || !path.exists() {
         return error;
     }
-    let fix = format!("run it again with a connection, which keeps this file as {}", changed_name(path).display());
+    let kept = changed_name(file, folder, commit);
+    let fix = format!("run it again with a connection, which keeps this file as {}", kept.display());
     let problem = "it differs from the hub's file, which could not be downloaded";
     Error::external(path.display().to_string(), format!("{problem}; {fix}: {error}"))
 }

@@ -44,6 +44,35 @@ fn missing_data_files_are_reported() {
     assert!(reader.is_err_and(|e| e.to_string().contains("damaged or missing")));
 }
 
+/// A link to itself stands for a folder or file that cannot be read for a moment; the permissions of files do not bind every user.
+#[cfg(all(unix, feature = "lerobot", feature = "hdf5"))]
+#[test]
+fn what_cannot_be_read_is_not_called_missing_or_damaged() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    for (name, parts) in [
+        ("d.lerobot", &["", "meta", "meta/info.json", "meta/episodes", "meta/episodes/chunk-000", "data"][..]),
+        ("d.folder", &["", "ep_len.npz"]),
+        ("d.video", &["", "ep_len.npz"]),
+        ("d.h5", &[""]),
+        ("d.lance", &["_versions"]),
+    ] {
+        let path = folder.path().join(name);
+        write(&path, WriteMode::Create, 1, 0..2);
+        for part in parts {
+            let (part, away) = (path.components().chain(Path::new(part).components()), folder.path().join("away"));
+            let part: std::path::PathBuf = part.collect();
+            std::fs::rename(&part, &away).expect("moving a part away");
+            std::os::unix::fs::symlink(&part, &part).expect("a link to itself");
+            let read = open(&path).and_then(|reader| reader.content_hash());
+            let error = read.expect_err("a part that cannot be read").to_string();
+            assert!(error.contains("Too many levels of symbolic links"), "{}: {error}", part.display());
+            std::fs::remove_file(&part).expect("removing the link");
+            std::fs::rename(&away, &part).expect("moving the part back");
+        }
+        open(&path).and_then(|reader| reader.content_hash()).expect("the dataset is intact");
+    }
+}
+
 /// Returns an image of 30 x 40 pixels with runs of equal pixels, gradients and noise.
 fn image() -> Vec<u8> {
     (0..40_u32 * 30 * 3).map(|i| if i / 3 % 40 < 15 { 90 } else { (i * i % 251 % (1 + i / 360)) as u8 }).collect()

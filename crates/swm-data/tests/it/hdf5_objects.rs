@@ -1,8 +1,11 @@
 //! HDF5 files in object stores, read by byte ranges.
 
 use crate::{format_suite, objects};
+use rand::Rng as _;
 use std::path::PathBuf;
-use swm_data::{Location, StepRange, WriteMode, open};
+use std::sync::Arc;
+use swm_core::{Batch, ColumnSpec, DType, Key, Schema};
+use swm_data::{Location, Reader, StepRange, WriteMode, WriteOptions, create, open};
 
 /// A folder with a bucket that has a dataset, and the path of the dataset.
 fn bucket() -> (tempfile::TempDir, PathBuf) {
@@ -11,6 +14,50 @@ fn bucket() -> (tempfile::TempDir, PathBuf) {
     let path = folder.path().join("bucket/d.h5");
     format_suite::write(&path, WriteMode::Create, 0..30);
     (folder, path)
+}
+
+/// As [`bucket`], with a file of 2 MB that has 40 episodes of noise.
+fn bucket_of_noise() -> (tempfile::TempDir, PathBuf) {
+    const ROWS: usize = 4;
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
+    let path = folder.path().join("bucket/d.h5");
+    let columns = [
+        ColumnSpec::image("pixels", 64, 64),
+        ColumnSpec::new("action", DType::Float32, [2]),
+        ColumnSpec::new("state", DType::Float64, [3]),
+        ColumnSpec::new("reward", DType::Float32, []),
+    ];
+    let schema = Schema::new(columns).expect("creating the schema");
+    let mut writer = create(&path, &schema, WriteOptions::default()).expect("creating the dataset");
+    for episode in 0..40 {
+        let (mut rows, mut rng) = (Batch::zeros(&schema, ROWS), Key::new(5).at(episode).rng());
+        rng.fill(rows.bytes_mut(0));
+        rows.row_mut(ROWS - 1).set(1, &[f32::NAN; 2]);
+        writer.write_episode(&rows).expect("writing an episode");
+    }
+    writer.finish().expect("finishing the dataset");
+    (folder, path)
+}
+
+/// All rows of all episodes.
+fn all_rows(reader: &dyn Reader) -> Vec<StepRange> {
+    reader.episodes().iter().enumerate().map(|(i, episode)| StepRange::new(i, 0, episode.length)).collect()
+}
+
+#[test]
+fn a_pass_over_a_file_fetches_it_about_once() {
+    let (folder, path) = bucket_of_noise();
+    let ranges = Arc::default();
+    let web = objects::serve_counted(folder.path(), false, &ranges);
+    let reader = open(Location::parse(&format!("{web}/bucket/d.h5")).expect("a location")).expect("the dataset");
+    for episode in all_rows(&*reader) {
+        reader.read(&["pixels", "action", "state", "reward"], &[episode]).expect("reading an episode");
+    }
+    let (size, ranges) = (path.metadata().expect("the file").len(), ranges.lock().expect("the ranges"));
+    let bytes: u64 = ranges.iter().map(|range| range.end - range.start).sum();
+    assert!(size > 1_900_000 && bytes >= size / 2, "{bytes} of {size} bytes");
+    assert!(ranges.len() < 20 && bytes < size * 3 / 2, "{} requests, {bytes} of {size} bytes", ranges.len());
 }
 
 #[test]
@@ -45,11 +92,10 @@ fn reads_files_in_a_bucket_and_on_a_web_server() {
 
 #[test]
 fn objects_that_are_written_over_while_they_are_open_are_refused() {
-    let (folder, path) = bucket();
+    let (folder, path) = bucket_of_noise();
     let web = objects::serve(folder.path(), false);
     let reader = open(Location::parse(&format!("{web}/bucket/d.h5")).expect("a location")).expect("the dataset");
-    let ranges = [StepRange::new(0, 0, 2)];
-    reader.read(&["state"], &ranges).expect("reading rows");
+    reader.read(&["state"], &[StepRange::new(0, 0, 2)]).expect("reading rows");
     // Another content of the same size, at the same time: the tag differs.
     let time = path.metadata().and_then(|found| found.modified()).expect("a time");
     let mut content = std::fs::read(&path).expect("the file");
@@ -58,7 +104,7 @@ fn objects_that_are_written_over_while_they_are_open_are_refused() {
     std::fs::write(&path, content).expect("writing it over");
     let file = std::fs::File::options().append(true).open(&path).expect("the file");
     file.set_modified(time).expect("setting the time");
-    let error = reader.read(&["pixels", "action"], &ranges).expect_err("another file").to_string();
+    let error = reader.read(&["pixels", "action"], &all_rows(&*reader)).expect_err("another file").to_string();
     assert!(error.contains("written over while it was read"), "{error}");
     assert!(error.contains("or several servers answer with other tags"), "{error}");
     assert!(error.matches("bytes with the tag ").count() == 2 && !error.contains("the tag none"), "{error}");

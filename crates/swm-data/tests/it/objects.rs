@@ -5,9 +5,10 @@ use crate::sample::{check, episode, manifest, options, schema, write};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use s3s::auth::SimpleAuth;
 use s3s::service::S3ServiceBuilder;
+use std::ops::Range;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use swm_data::lance::{Shard, commit_shards, create_shard};
 use swm_data::objects::{ObjectFile, list_names};
 use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOptions, create, open};
@@ -21,6 +22,12 @@ const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 /// Returns the server's address. Unlike S3, this server checks for an existing object and writes in two steps, so
 /// writes are serialised.
 pub fn serve(root: &Path, keys: bool) -> String {
+    serve_counted(root, keys, &Arc::default())
+}
+
+/// As [`serve`]; notes the byte ranges of all requests.
+pub fn serve_counted(root: &Path, keys: bool, ranges: &Arc<Mutex<Vec<Range<u64>>>>) -> String {
+    let ranges = Arc::clone(ranges);
     let mut service =
         S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("creating the file system of the server"));
     if keys {
@@ -37,8 +44,9 @@ pub fn serve(root: &Path, keys: bool) -> String {
             let listener = tokio::net::TcpListener::from_std(listener).expect("creating the TCP listener");
             while let Ok((socket, _)) = listener.accept().await {
                 let server = hyper_util::server::conn::auto::Builder::new(TokioExecutor::new());
-                let (service, writing) = (service.clone(), Arc::clone(&writing));
-                let serialised = hyper::service::service_fn(move |request| {
+                let (service, writing, ranges) = (service.clone(), Arc::clone(&writing), Arc::clone(&ranges));
+                let serialised = hyper::service::service_fn(move |request: hyper::Request<_>| {
+                    ranges.lock().expect("the ranges").extend(requested_range(request.headers()));
                     let (service, writing) = (service.clone(), Arc::clone(&writing));
                     async move {
                         let writes = request.method() == hyper::Method::PUT;
@@ -53,6 +61,12 @@ pub fn serve(root: &Path, keys: bool) -> String {
         });
     });
     format!("http://{address}")
+}
+
+/// The bytes that a request asks for; `None` for all of an object.
+fn requested_range(headers: &hyper::HeaderMap) -> Option<Range<u64>> {
+    let (first, last) = headers.get("range")?.to_str().ok()?.strip_prefix("bytes=")?.split_once('-')?;
+    Some(first.parse().ok()?..last.parse::<u64>().ok()? + 1)
 }
 
 /// A process that runs one of the child tests below.
@@ -75,7 +89,7 @@ fn target() -> Option<Location> {
     Some(Location::parse(&std::env::var(TARGET).ok()?).expect("parsing the location"))
 }
 
-fn write_to(location: &Location, mode: WriteMode, episodes: std::ops::Range<usize>) {
+fn write_to(location: &Location, mode: WriteMode, episodes: Range<usize>) {
     let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
     let mut writer =
         create(location, &schema(), WriteOptions { commit, ..options(mode) }).expect("creating the dataset");

@@ -1,9 +1,9 @@
 //! Prediction errors of models whose errors are known in closed form.
 
 use crate::evaluating::recorded;
-use crate::memory::MemoryReader;
+use crate::memory::{Memory, MemoryReader};
 use swm_core::results::Prediction;
-use swm_core::{Batch, Error, Result};
+use swm_core::{Batch, DType, Error, Result, Schema};
 use swm_data::{Reader as _, StepRange};
 use swm_eval::Starts;
 use swm_eval::prediction::{Predictor, predict, predict_recorded};
@@ -81,6 +81,33 @@ fn prediction_errors_equal_the_closed_form() {
     let exact = predict(&mut Drifting { drift: 0.0 }, &reader, &picks, 3, |_| None).expect("the prediction succeeds");
     assert!(exact.groups[0].trajectory.p95 < 1e-12, "{:?}", exact.groups[0]);
     assert_eq!(exact.groups.len(), 1, "trajectories without an outcome have no groups by success");
+}
+
+/// The dataset with its actions as float64.
+fn with_float64_actions(reader: &MemoryReader) -> MemoryReader {
+    let memory = Memory::default();
+    for (episode, length) in reader.episodes().iter().map(|episode| episode.length).enumerate() {
+        let rows = reader.read(&["state", "action"], &[StepRange::new(episode, 0, length)]).expect("reading rows");
+        let mut columns = rows.schema().columns().to_vec();
+        columns[1].dtype = DType::Float64;
+        let mut double = Batch::zeros(&Schema::new(columns).expect("creating the schema"), length);
+        for step in 0..length {
+            double.row_mut(step).set(0, rows.row(step).at::<f64>(0));
+            double.row_mut(step).set(1, &rows.row(step).to_f64("action").expect("reading the action"));
+        }
+        memory.episodes.lock().expect("no thread has panicked").push(double);
+    }
+    memory.reader()
+}
+
+#[test]
+fn float64_actions_predict_as_their_float32_values() {
+    let reader = recorded(20);
+    let picks = Starts::choose(&reader, 9, 6, 2).expect("the dataset has enough starts");
+    let [single, double] = [&reader, &with_float64_actions(&reader)].map(|reader| {
+        predict(&mut Drifting { drift: 0.5 }, reader, &picks, 3, |_| None).expect("the prediction succeeds")
+    });
+    assert_eq!(single, double);
 }
 
 /// A model with a constant prediction.

@@ -4,7 +4,7 @@ use super::tree::Node;
 use super::{Model, Settings};
 use serde::{Deserialize, Serialize};
 
-/// A message of the page.
+/// A message of the page. Unit variants would accept unknown fields.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
@@ -30,9 +30,9 @@ pub enum Request {
         dataset: Option<Named>,
     },
     /// Executes the present plan, then searches the next one and stops.
-    Decide,
+    Decide {},
     /// One step of the environment; searches if a plan is due.
-    Step,
+    Step {},
     /// Steps at the chosen speed, or stops.
     Play {
         /// Whether to step.
@@ -66,11 +66,11 @@ pub enum Request {
         node: usize,
     },
     /// Forgets all steps that do not lead to the present one.
-    Forget,
+    Forget {},
     /// Ends the search that is under way, whose plan is the best so far, or the fit of a decoder.
-    Enough,
+    Enough {},
     /// The page has shown a frame, and can receive another.
-    Shown,
+    Shown {},
 }
 
 /// A dataset of a folder.
@@ -157,6 +157,7 @@ mod tests {
     fn unknown_messages_fields_and_settings_are_errors() {
         let parse = |text: &str| serde_json::from_str::<Request>(text).ok();
         assert_eq!(parse(r#"{"type": "go", "node": 3}"#), Some(Request::Go { node: 3 }));
+        assert_eq!(parse(r#"{"type": "step"}"#), Some(Request::Step {}));
         assert!(matches!(
             parse(
                 r#"{"type": "settings", "planner": {"model": "simulator", "solver": "cem", "horizon": 5,
@@ -169,6 +170,11 @@ mod tests {
             r#"{"type": "go", "node": 1.5}"#,
             r#"{"type": "go", "path": "/etc"}"#,
             r#"{"type": "exec", "shell": "ls"}"#,
+            r#"{"type": "decide", "node": 1}"#,
+            r#"{"type": "step", "count": 2}"#,
+            r#"{"type": "forget", "node": 1}"#,
+            r#"{"type": "enough", "node": 1}"#,
+            r#"{"type": "shown", "frame": 1}"#,
             r#"{"type": "settings", "planner": {"model": "simulator"}}"#,
             r#"{"type": "settings", "planner": {"model": "simulator", "solver": "cem", "horizon": 5, "receding": 1,
                 "block": 5, "score": "terminal", "warm": true, "module": "os"}}"#,

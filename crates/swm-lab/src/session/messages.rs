@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use swm_core::{EnvEntry, EnvSpec};
 
-/// A message of the page.
+/// A message of the page. Unit variants would accept unknown fields.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
@@ -34,7 +34,7 @@ pub enum Request {
         on: bool,
     },
     /// One step.
-    Step,
+    Step {},
     /// Sets the number of steps a second.
     Speed {
         /// Steps a second, 1 to 240.
@@ -51,18 +51,18 @@ pub enum Request {
         action: Vec<f64>,
     },
     /// The page has shown a frame, and can receive another.
-    Shown,
+    Shown {},
     /// Records the episodes from the next reset on into a dataset, which is created or continued.
     Record {
         /// The name of the dataset.
         dataset: String,
     },
     /// Stores the recorded episode.
-    Keep,
+    Keep {},
     /// Drops the recorded episode.
-    Discard,
+    Discard {},
     /// Ends recording.
-    Finish,
+    Finish {},
 }
 
 /// A message of the server.
@@ -126,6 +126,7 @@ mod tests {
     fn unknown_messages_and_fields_are_errors() {
         let parse = |text: &str| serde_json::from_str::<Request>(text).ok();
         assert_eq!(parse(r#"{"type": "play", "on": true}"#), Some(Request::Play { on: true }));
+        assert_eq!(parse(r#"{"type": "step"}"#), Some(Request::Step {}));
         let reset = Request::Reset {
             seed: 7,
             pin: "a=1".to_owned(),
@@ -144,6 +145,11 @@ mod tests {
             r#"{"type": "reset", "seed": -1}"#,
             r#"{"type": "reset", "seed": 1, "env": "module:x"}"#,
             r#"{"type": "act", "action": ["1"]}"#,
+            r#"{"type": "step", "count": 2}"#,
+            r#"{"type": "shown", "frame": 1}"#,
+            r#"{"type": "keep", "dataset": "x"}"#,
+            r#"{"type": "discard", "dataset": "x"}"#,
+            r#"{"type": "finish", "dataset": "x"}"#,
         ] {
             assert_eq!(parse(text), None, "{text}");
         }

@@ -50,7 +50,7 @@ impl Session for Player<'static> {
 
     fn kind(request: &Request) -> Kind {
         match request {
-            Request::Shown => Kind::Shown,
+            Request::Shown {} => Kind::Shown,
             Request::Act { .. } => Kind::Replaceable,
             _ => Kind::Ordered,
         }
@@ -140,7 +140,7 @@ impl<'a> Player<'a> {
                 self.playing = on && !self.ended;
                 self.send_frame()
             }
-            Request::Step => self.step(),
+            Request::Step {} => self.step(),
             Request::Speed { fps } => {
                 if !(1.0..=FASTEST).contains(&fps) {
                     return Err(Error::config(
@@ -159,20 +159,20 @@ impl<'a> Player<'a> {
                 self.hand = action;
                 Ok(())
             }
-            Request::Shown => Ok(()),
+            Request::Shown {} => Ok(()),
             Request::Record { dataset } => self.record(&dataset),
-            Request::Keep => {
+            Request::Keep {} => {
                 let recorder = self.recorder.as_mut().ok_or_else(nothing_recorded)?;
                 recorder.keep(&self.world)?;
                 self.report_recording();
                 Ok(())
             }
-            Request::Discard => {
+            Request::Discard {} => {
                 self.recorder.as_mut().ok_or_else(nothing_recorded)?.discard();
                 self.report_recording();
                 Ok(())
             }
-            Request::Finish => {
+            Request::Finish {} => {
                 let recorder = self.recorder.take().ok_or_else(nothing_recorded)?;
                 let episodes = recorder.episodes();
                 recorder.finish()?;

@@ -85,7 +85,7 @@ impl DinoWmCost {
         let (row, device) = (infos.row(env), self.model.device());
         // One image per call: features must not depend on the number of images in a call.
         let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.backbone.patches(self.config.image_patches(rgb, &device)?));
-        let column = |name: &str, values: &[f32]| normalised(&self.dataset_info, name, values, [1, 1], &device);
+        let column = |name: &str, from: &str| normalised(&self.dataset_info, name, &row.to_f32(from)?, [1, 1], &device);
         // The recorded history has images and actions only: if the model reads further columns, a plan starts from the
         // current frame.
         let further_columns: Vec<&str> =
@@ -110,7 +110,7 @@ impl DinoWmCost {
             .iter()
             .map(|spec| match spec.name.as_str() {
                 ACTION => Ok(Tensor::zeros([1, count, self.action_dim], &device)),
-                name => column(name, row.get::<f32>(name)?),
+                name => column(name, name),
             })
             .collect();
         let mut columns = vec![];
@@ -118,7 +118,7 @@ impl DinoWmCost {
         for ((name, encoder), (_, span)) in self.model.extra_encoders.iter().zip(spans) {
             let goal = format!("goal_{name}");
             if name != ACTION && infos.schema().find(&goal).is_some() {
-                let features = encoder.forward(column(name, row.get::<f32>(&goal)?)?);
+                let features = encoder.forward(column(name, &goal)?);
                 columns.push((span, features.squeeze_dim(0)));
             }
         }

@@ -12,7 +12,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use swm_core::columns::PIXELS;
-use swm_core::{Batch, DType, Error, Result, Schema};
+use swm_core::{Batch, Error, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
 /// The loss settings of a DINO-WM, an empty table.
@@ -62,11 +62,11 @@ impl Trainable for DinoWm {
         let mut columns = vec![PIXELS.to_owned()];
         for column in &config.model.columns {
             let spec = schema.column(&column.name)?;
-            if spec.dtype != DType::Float32 {
+            if spec.is_image() {
                 return Err(Error::mismatch(
                     format!("reading the column '{}' of model.columns", column.name),
-                    spec.dtype.name(),
-                    "float32 (remove the column from model.columns, or convert the dataset)",
+                    "images",
+                    "a column of numeric values (remove the column from model.columns)",
                 ));
             }
             columns.push(column.name.clone());
@@ -112,7 +112,7 @@ impl Trainable for DinoWm {
             .iter()
             .map(|column| match column.name.as_str() {
                 ACTION => dataset_info.actions(batch, data.num_steps, data.frameskip, device),
-                name => normalised(dataset_info, name, batch.get::<f32>(name)?, [batch.rows(), data.num_steps], device),
+                name => normalised(dataset_info, name, &batch.to_f32(name)?, [batch.rows(), data.num_steps], device),
             })
             .collect();
         let columns = columns?;

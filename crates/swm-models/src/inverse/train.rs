@@ -252,7 +252,7 @@ impl Pairs {
             })
             .collect();
         let encoded = encoded?.concat();
-        let actions_taken = batch.get::<f32>(ACTION)?;
+        let actions_taken = batch.to_f32(ACTION)?;
         let count = batch.rows() * offset;
         let mut pairs =
             Self { latents: Vec::with_capacity(2 * count * latent), actions: vec![0.0; count * action_dim], count };

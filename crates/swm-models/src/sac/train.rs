@@ -129,7 +129,7 @@ impl StochasticActor for Sac {
         let device = self.log_ent_coef.val().device();
         let mut observation = vec![];
         for column in &config.model.columns {
-            observation.extend(row.to_f64(column)?.into_iter().map(|v| v as f32));
+            observation.extend(row.to_f32(column)?);
         }
         let inputs = self.inputs();
         if observation.len() != inputs {

@@ -158,7 +158,7 @@ pub(super) fn observe_row(config: &Tdmpc2Config, model: &Tdmpc2, row: RowRef<'_>
     let device = model.device();
     let columns = config.column_encodings().zip(model.extra_encoders.iter()).map(|(encoding, (_, encoder))| {
         let width = encoder._0.weight.dims()[1];
-        let values: Vec<f32> = row.to_f64(&encoding.column)?.into_iter().map(|v| v as f32).collect();
+        let values = row.to_f32(&encoding.column)?;
         if values.len() != width {
             let given = format!("{} elements in '{}'", values.len(), encoding.column);
             return Err(Error::mismatch("acting", given, format!("{width}, as the model was trained")));

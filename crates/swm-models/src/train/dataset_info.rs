@@ -4,7 +4,7 @@ use crate::nn::parameters::Named;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use swm_core::columns::{ACTION, PIXELS, REWARD, TERMINATED};
-use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Schema, Space, precision};
+use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Space, precision};
 use swm_data::{Reader, column_stats};
 use swm_plan::ActionScale;
 
@@ -88,6 +88,15 @@ impl ColumnInfo {
         Err(Error::config(format!("column '{name}' of the training data"), given, fix))
     }
 
+    /// Checks that models, which compute with single precision, can tell the values of the column `spec` apart.
+    fn check_precision(&self, spec: &ColumnSpec) -> Result<()> {
+        (0..self.dim()).try_for_each(|element| {
+            let largest = self.magnitude(element);
+            let error = precision::rounding(spec.dtype, largest);
+            precision::check(&spec.name, element, largest, self.std[element], error)
+        })
+    }
+
     /// The largest magnitude of an element.
     fn magnitude(&self, element: usize) -> f64 {
         self.min[element].abs().max(self.max[element].abs())
@@ -131,69 +140,55 @@ impl DatasetInfo {
         Ok(())
     }
 
-    /// Checks that models, which compute with single precision, can tell the values of the columns apart. `columns` are those that
-    /// the model reads.
-    ///
-    /// # Errors
-    /// When a column has values beyond single precision, or values that are far larger than their deviation; the error names it.
-    pub fn check_precision(&self, schema: &Schema, columns: &[String]) -> Result<()> {
-        for (name, column) in columns.iter().filter_map(|name| Some((name, self.columns.get(name)?))) {
-            let Ok(&ColumnSpec { dtype, .. }) = schema.column(name) else { continue };
-            for element in 0..column.dim() {
-                let largest = column.magnitude(element);
-                let error = precision::rounding(dtype, largest);
-                precision::check(name, element, largest, column.std[element], error)?;
-            }
-        }
-        Ok(())
-    }
-
     /// Computes the statistics of a dataset. `columns` names the columns that the model observes; images are
     /// skipped. Actions are standardised, or, if `bounded`, mapped from their range in the data to -1 ..= 1.
     ///
     /// # Errors
     /// When there is no column of continuous actions, a column is missing, or the data are damaged.
     pub fn from_reader(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
-        Self::checked(reader, columns, bounded, |_, _| Ok(()))
+        Self::checked(reader, columns, bounded, false)
     }
 
     /// As [`DatasetInfo::from_reader`], for a training on the columns.
     ///
     /// # Errors
-    /// As there, and when a column would be treated as constant although it varies.
+    /// As there, and when a column would be treated as constant although it varies, or single precision cannot tell its
+    /// values apart.
     pub fn for_training(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
-        Self::checked(reader, columns, bounded, |name, column| column.check_scale(name))
+        Self::checked(reader, columns, bounded, true)
     }
 
-    /// Computes the statistics, and checks each column but those whose range is scaled.
-    fn checked(
-        reader: &dyn Reader,
-        columns: &[String],
-        bounded: bool,
-        check: impl Fn(&str, &ColumnInfo) -> Result<()>,
-    ) -> Result<Self> {
+    /// Computes the statistics, and checks the columns for a training.
+    fn checked(reader: &dyn Reader, columns: &[String], bounded: bool, training: bool) -> Result<Self> {
         let schema = reader.schema();
         let action = schema.column(ACTION)?;
-        if action.dtype != DType::Float32 {
+        if !matches!(action.dtype, DType::Float32 | DType::Float64) {
             return Err(Error::mismatch(
                 "training a model",
                 format!("{} actions", action.dtype.name()),
-                "float32 actions of a continuous action space",
+                "float32 or float64 actions of a continuous action space (choose a dataset with such actions)",
             ));
         }
-        let action = ColumnInfo::of(reader, action)?;
+        let info = |spec: &ColumnSpec| {
+            let column = ColumnInfo::of(reader, spec)?;
+            if training {
+                column.check_precision(spec)?;
+                // A range of actions is mapped to -1 ..= 1 whatever its size.
+                if !(bounded && spec.name == ACTION) {
+                    column.check_scale(&spec.name)?;
+                }
+            }
+            Ok(column)
+        };
+        let action = info(action)?;
         let mut observed = Named::new();
         for name in columns.iter().filter(|name| *name != ACTION) {
             let spec = schema.column(name)?;
-            if spec.dtype != DType::U8 {
-                let column = ColumnInfo::of(reader, spec)?;
-                check(name, &column)?;
-                observed.insert(name.clone(), column);
+            // Rewards and flags are not observations. Only those in bytes are left out, as in the stored checkpoints.
+            let is_left_out = spec.dtype == DType::U8 && [REWARD, TERMINATED].contains(&name.as_str());
+            if !spec.is_image() && !is_left_out {
+                observed.insert(name.clone(), info(spec)?);
             }
-        }
-        // A range is mapped to -1 ..= 1 whatever its size.
-        if !bounded {
-            check(ACTION, &action)?;
         }
         let env = reader.manifest().and_then(|manifest| Some(manifest.config.get("env")?.as_str()?.to_owned()));
         let action = if bounded { range_scale(&action) } else { standard_scale(&action) };
@@ -243,10 +238,10 @@ impl DatasetInfo {
     /// `[clips, steps, frameskip * action_dim]`.
     ///
     /// # Errors
-    /// When there is no column of actions, or the column is of another type.
+    /// When there is no column of actions.
     pub fn actions(&self, batch: &Batch, steps: usize, frameskip: usize, device: &Device) -> Result<Tensor<3>> {
         let dim = self.action.dim();
-        let mut actions = batch.get::<f32>(ACTION)?.to_vec();
+        let mut actions = batch.to_f32(ACTION)?;
         let mut scaled = vec![0.0; dim];
         for action in actions.chunks_exact_mut(dim) {
             self.action.to_model(action, &mut scaled);

@@ -119,7 +119,6 @@ impl Inputs {
         let goals = loader.goals.iter().flat_map(|goal| &goal.columns);
         let columns: Vec<String> = loader.clip.columns.iter().chain(goals).cloned().collect();
         let dataset_info = DatasetInfo::for_training(reader, &columns, M::BOUNDED_ACTIONS)?;
-        dataset_info.check_precision(reader.schema(), &columns)?;
         let manifest = learner::manifest(config, reader.content_hash()?, &options.device);
         Ok(Self { loader, dataset_info, manifest })
     }

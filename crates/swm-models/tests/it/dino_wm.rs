@@ -56,6 +56,22 @@ fn dataset_info(config: &TrainConfig<DinoWm>) -> DatasetInfo {
 }
 
 #[test]
+fn columns_of_other_types_train_as_their_float32_values() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let config = config(&[POSITIONS]).expect("loading the configuration");
+    // Bytes have no fractions.
+    for (other, is_whole) in [(DType::U8, true), (DType::Float64, false)] {
+        let weights = [DType::Float32, other].map(|dtype| {
+            let value = |value: f32| f64::from(if is_whole { value.round() } else { value });
+            let reader = Arc::new(Dots::new(6, 0).stored_as(2, dtype, value));
+            let out = folder.path().join(format!("{} {}", other.name(), dtype.name()));
+            train(&config, reader, &out, &crate::options(), &mut Control::new()).expect("training the model").weights
+        });
+        assert_eq!(weights[0], weights[1], "{}", other.name());
+    }
+}
+
+#[test]
 fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let config = config(&[POSITIONS, "model.decoder=16"]).expect("loading the configuration");
@@ -275,6 +291,24 @@ fn gradients_match_finite_differences() {
         let difference = (cost_at(i, 2e-2) - cost_at(i, -2e-2)) / 4e-2;
         assert!((difference - slope).abs() < 0.03 * largest, "element {i}: {slope}, not {difference}");
     }
+}
+
+#[test]
+fn columns_of_float64_cost_as_their_float32_values() {
+    let mut single = infos(&["position", "goal_position"]);
+    let mut columns = single.schema().columns().to_vec();
+    columns[2..].iter_mut().for_each(|column| column.dtype = DType::Float64);
+    let mut double = Batch::zeros(&Schema::new(columns).expect("creating the schema"), ENVS);
+    for env in 0..ENVS {
+        single.row_mut(env).at::<f32>(2)[0] += 0.1;
+        let (from, mut to) = (single.row(env), double.row_mut(env));
+        (0..2).for_each(|image| to.set(image, from.at::<u8>(image)));
+        for (column, name) in [(2, "position"), (3, "goal_position")] {
+            to.set(column, &from.to_f64(name).expect("the values"));
+        }
+    }
+    let [single, double] = [single, double].map(|infos| costs(&[POSITIONS], &infos, &[0, 1], 1));
+    assert_eq!(single, double);
 }
 
 #[test]

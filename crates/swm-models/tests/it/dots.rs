@@ -82,6 +82,37 @@ impl Dots {
         self
     }
 
+    /// Stores a column as another type, with a function of its values.
+    pub fn stored_as(mut self, column: usize, dtype: DType, value: impl Fn(f32) -> f64) -> Self {
+        let mut columns = self.rows.schema().columns().to_vec();
+        columns[column].dtype = dtype;
+        let name = columns[column].name.clone();
+        let values = self.rows.to_f32(&name).expect("the values").into_iter().map(value);
+        let mut rows = Batch::zeros(&Schema::new(columns).expect("creating the schema"), self.rows.rows());
+        for other in (0..rows.schema().columns().len()).filter(|other| *other != column) {
+            rows.bytes_mut(other).copy_from_slice(self.rows.bytes(other));
+        }
+        let bytes: Vec<u8> = match dtype {
+            DType::Float64 => values.flat_map(f64::to_ne_bytes).collect(),
+            DType::Float32 => values.flat_map(|value| (value as f32).to_ne_bytes()).collect(),
+            DType::U8 => values.map(|value| value as u8).collect(),
+            other => panic!("{} is not supported", other.name()),
+        };
+        rows.bytes_mut(column).copy_from_slice(&bytes);
+        self.rows = rows;
+        self
+    }
+
+    /// Gives a column another name.
+    pub fn renamed(mut self, column: usize, name: &str) -> Self {
+        let mut columns = self.rows.schema().columns().to_vec();
+        columns[column].name = name.to_owned();
+        let mut rows = Batch::zeros(&Schema::new(columns).expect("creating the schema"), self.rows.rows());
+        (0..rows.schema().columns().len()).for_each(|i| rows.bytes_mut(i).copy_from_slice(self.rows.bytes(i)));
+        self.rows = rows;
+        self
+    }
+
     /// Sets the first action of an episode.
     pub fn with_action(mut self, episode: usize, action: [f32; 2]) -> Self {
         self.rows.row_mut(episode * LENGTH).set(1, &action);

@@ -7,10 +7,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::files::Lock;
 use swm_core::run::{Control, Event};
-use swm_core::{Key, Result};
+use swm_core::{DType, Key, Result};
 use swm_models::lewm::{DecoderConfig, EncoderConfig, Lewm};
 use swm_models::nn::keypoints::FilterConfig;
 use swm_models::nn::{ConvConfig, Init, KeypointsConfig, parameters};
+use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, run_folder, train};
 
 /// A model of a few thousand parameters.
@@ -57,6 +58,39 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
     ["config.json", "weights.safetensors", "optimizer.safetensors", "state.json", "manifest.json"]
         .map(|name| std::fs::read(run.join("checkpoint").join(name)).expect(name))
         .to_vec()
+}
+
+#[test]
+fn float64_actions_train_as_their_float32_values() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let trained = |name: &str, dots: Dots| {
+        train(&config(&[]), Arc::new(dots), &folder.path().join(name), &crate::options(), &mut Control::new())
+    };
+    let single = trained("single", Dots::new(6, 0)).expect("training on float32 actions");
+    let double = Dots::new(6, 0).stored_as(1, DType::Float64, f64::from);
+    assert_eq!(trained("double", double).expect("training on float64 actions").weights, single.weights);
+    let far = Dots::new(6, 0).stored_as(1, DType::Float64, |value| f64::from(value) + 1e9);
+    for bounded in [false, true] {
+        let error = DatasetInfo::for_training(&far, &[], bounded).expect_err("single precision").to_string();
+        assert!(error.contains("column 'action', element 0") && error.contains("offset"), "{error}");
+    }
+    let discrete = Dots::new(6, 0).stored_as(1, DType::U8, |value| f64::from(value.abs()));
+    let error = trained("discrete", discrete).expect_err("discrete actions").to_string();
+    assert!(error.contains("uint8 actions") && error.contains("choose a dataset"), "{error}");
+}
+
+#[test]
+fn rewards_and_flags_in_bytes_are_not_in_the_statistics() {
+    for (name, dtype, has_statistics) in [
+        ("terminated", DType::U8, false),
+        ("reward", DType::U8, false),
+        ("reward", DType::Float32, true),
+        ("state", DType::U8, true),
+    ] {
+        let dots = Dots::new(6, 0).stored_as(2, dtype, |value| f64::from(value.round())).renamed(2, name);
+        let info = DatasetInfo::for_training(&dots, &[name.to_owned()], false).expect("the statistics");
+        assert_eq!(info.columns.contains_key(name), has_statistics, "{name} of {}", dtype.name());
+    }
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! [`ModelSource`]: the MJCF text of a model of the suite, compiled with factors of variation.
 
 use super::model_edit::ModelEdit;
-use crate::physics::compile_spec;
+use crate::physics::{COMPILATION_BYTES, compile_spec};
 use crate::{assets, link};
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::{MjModel, MjSpec};
@@ -40,7 +40,7 @@ impl ModelSource {
         factors: &FactorValues,
         edit: impl FnOnce(&mut ModelEdit<'_>) -> Result<()>,
     ) -> Result<MjModel> {
-        link::load()?;
+        link::load_to_compile(COMPILATION_BYTES)?;
         let failed = |error: &dyn std::fmt::Display| Error::external(format!("compiling {}", self.name), error);
         let mut vfs = MjVfs::new();
         for (name, content) in COMMON.iter().zip(&self.common) {

@@ -13,12 +13,18 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
+/// The memory that MuJoCo takes at most to compile a model without meshes.
+pub const COMPILATION_BYTES: usize = 96 << 20;
+
+/// The memory that MuJoCo takes at most to compile a model with the meshes of a robot.
+const MESHES_BYTES: usize = 192 << 20;
+
 /// Compiles a model from an MJCF file.
 ///
 /// # Errors
 /// When MuJoCo is not installed, or rejects the model (the error contains its message).
 pub fn compile_file(path: &Path) -> Result<MjModel> {
-    link::load()?;
+    link::load_to_compile(MESHES_BYTES)?;
     MjModel::from_xml(path).map_err(|error| Error::external(format!("compiling {}", path.display()), error))
 }
 
@@ -28,7 +34,7 @@ pub fn compile_file(path: &Path) -> Result<MjModel> {
 /// # Errors
 /// When MuJoCo is not installed, or rejects the model (the error contains its message).
 pub fn compile_xml(label: &str, xml: &str, files: &[(&str, &[u8])]) -> Result<MjModel> {
-    link::load()?;
+    link::load_to_compile(COMPILATION_BYTES)?;
     let failed = |error: &dyn std::fmt::Display| Error::external(format!("compiling {label}"), error);
     let mut vfs = MjVfs::new();
     for (name, content) in files {

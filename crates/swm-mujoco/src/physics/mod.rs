@@ -17,7 +17,7 @@ mod stepping;
 
 pub(crate) use appearance::Appearance;
 pub(crate) use compile::edit_welds;
-pub use compile::{compile_file, compile_spec, compile_xml, index_of, shared_model};
+pub use compile::{COMPILATION_BYTES, compile_file, compile_spec, compile_xml, index_of, shared_model};
 pub(crate) use hooks::{EqualityRow, GeomPoses, StepHooks};
 pub use simulation::Physics;
 pub(crate) use state_layout::check_finite;

@@ -14,6 +14,9 @@ use swm_core::{Error, Result};
 const UNSTABLE: [mjtWarning; 4] =
     [mjtWarning::mjWARN_BADQPOS, mjtWarning::mjWARN_BADQVEL, mjtWarning::mjWARN_BADQACC, mjtWarning::mjWARN_BADCTRL];
 
+/// Memory of a state beside that in its buffers, at most.
+const STATE_BYTES: usize = 32 << 20;
+
 /// The call that computed the derived quantities (poses, velocities, sensors) from `Physics::source_state`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Derivation {
@@ -52,6 +55,10 @@ impl Physics {
     /// # Errors
     /// When memory cannot be allocated.
     pub fn new(original: Arc<MjModel>) -> Result<Self> {
+        let sizes = original.ffi();
+        // The copy, the state, which is smaller than a model, and the state's scratch memory.
+        let bytes = 2 * sizes.nbuffer + sizes.narena;
+        link::check_memory("allocating a MuJoCo state", usize::try_from(bytes).unwrap_or(0) + STATE_BYTES)?;
         let copy = Box::new(MjModel::clone(&original));
         let data = MjData::try_new(copy).map_err(|error| Error::external("allocating a MuJoCo state", error))?;
         let mut physics = Self {

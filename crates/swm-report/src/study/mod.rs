@@ -48,7 +48,8 @@ pub struct StudyPage {
 /// Writes the page of a study to `out_dir/index.html`, and its figures to `out_dir/figures/` as SVG and PNG. Returns the path
 /// of the page.
 ///
-/// Equal results give equal bytes.
+/// Equal results give equal bytes. The caller holds the [`Lock`](files::Lock) of `out_dir`, because files that a kill left in
+/// `out_dir/figures/` are deleted.
 ///
 /// # Errors
 /// When a file cannot be written.
@@ -72,11 +73,20 @@ fn write_files(out_dir: &Path, html: &str, figures: &[Placed]) -> Result<PathBuf
     let path = out_dir.join("index.html");
     files::write(&path, html.as_bytes())?;
     std::fs::create_dir_all(&folder).map_err(|source| Error::io(&folder, "creating the folder of figures", source))?;
+    // What a kill left of an earlier page, whose figures may have been others.
+    files::delete_temporary(&folder, is_figure)?;
     for figure in figures {
         files::write(&folder.join(format!("{}.svg", figure.file)), figure.drawn.drawing.svg.as_bytes())?;
         files::write(&folder.join(format!("{}.png", figure.file)), &figure.drawn.drawing.png)?;
     }
     Ok(path)
+}
+
+/// Whether a file has a name as the files of figures have it, such as `drop-1.svg`.
+fn is_figure(name: &str) -> bool {
+    let stem = name.strip_suffix(".svg").or_else(|| name.strip_suffix(".png"));
+    let number = stem.and_then(|stem| stem.rsplit_once('-')).map(|(_, number)| number);
+    number.is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()))
 }
 
 /// A figure of a sheet.

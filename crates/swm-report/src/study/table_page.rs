@@ -23,8 +23,8 @@ pub struct TablePage {
     pub command: Option<String>,
 }
 
-/// Writes the page of such a study as [`write_study`](super::write_study) writes that of evaluations. Returns the path of the
-/// page.
+/// Writes the page of such a study as [`write_study`](super::write_study) writes that of evaluations, with the same
+/// lock. Returns the path of the page.
 ///
 /// # Errors
 /// When a file cannot be written.

@@ -455,6 +455,18 @@ fn figures_are_not_written_through_a_link() {
 }
 
 #[test]
+fn temporary_files_of_a_killed_report_are_deleted() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let figures = folder.path().join("figures");
+    fs::create_dir(&figures).expect("creating a folder");
+    let names = ["drop-1.svg", "drop-2.png", "thesis.svg", "-+3.png"];
+    let names = names.map(|name| figures.join(format!(".{name}.12.tmp")));
+    names.iter().for_each(|name| fs::write(name, "").expect("writing a file"));
+    write_study(&factors(), folder.path()).expect("writing the page");
+    assert_eq!(names.map(|name| name.exists()), [false, false, true, true]);
+}
+
+#[test]
 fn study_without_results_has_a_page() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let page = page(&of(vec![]), folder.path());

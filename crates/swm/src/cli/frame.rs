@@ -17,7 +17,7 @@ use swm_lab::still::Still;
 pub struct FrameArgs {
     /// The environment, such as swm/TwoRoom-v1 or swm/OGBCube-v0,env_type=double
     env: String,
-    /// Seed of the reset, such as the episode_seed of a dataset
+    /// Seed of the reset, whose parts a dataset has as episode_seed
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Frame size in pixels: 64 or HEIGHTxWIDTH

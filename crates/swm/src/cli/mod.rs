@@ -322,7 +322,7 @@ impl Cli {
     fn dispatch(self) -> anyhow::Result<()> {
         let json = self.json;
         limits::THREADS.check(self.threads)?;
-        // Rayon starts as many threads as this variable says; hashing files uses them, whatever `--threads` is.
+        // Rayon starts as many threads as this variable says where `--threads` does not: some commands do not pass that on.
         let of_rayon = std::env::var("RAYON_NUM_THREADS").ok().and_then(|text| text.parse().ok());
         limits::RAYON_THREADS.check(of_rayon.unwrap_or(0))?;
         check_stack(std::env::var("RUST_MIN_STACK").ok().as_deref())?;
@@ -337,8 +337,8 @@ impl Cli {
             Command::Devices => devices::devices(json),
             Command::Datasets(args) => datasets::datasets(&args, json),
             Command::Formats => datasets::formats(json),
-            Command::Inspect(args) => inspect::inspect(&args, json),
-            Command::Preview(args) => datasets::preview(&args, json),
+            Command::Inspect(args) => on_threads(self.threads, || inspect::inspect(&args, json)),
+            Command::Preview(args) => on_threads(self.threads, || datasets::preview(&args, json)),
             Command::Models => models::models(json),
             Command::Plot(args) => plot::plot(&args, json),
             Command::Completions(args) => shell::completions(&args),
@@ -384,6 +384,17 @@ impl Context {
         crate::home::show_downloads(move || progress::control(&of_downloads));
         Ok(context)
     }
+}
+
+/// Runs a command that decodes or hashes on `threads` threads, or on one where the system cannot start as many: rayon's global pool
+/// would panic at its first use.
+///
+/// # Errors
+/// Those of the command, and when not even one thread can be started.
+fn on_threads(threads: usize, command: impl FnOnce() -> anyhow::Result<()> + Send) -> anyhow::Result<()> {
+    // Before the others, because the threads of a pool that could not be started end later.
+    let one = swm_core::pool::threads(1)?;
+    swm_core::pool::threads(threads).unwrap_or(one).install(command)
 }
 
 /// Prints a panic as one line, and its backtrace only if `RUST_BACKTRACE` asks for one. It holds no lock while it

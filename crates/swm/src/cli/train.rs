@@ -126,9 +126,11 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
     Ok((summary.checkpoint.clone(), json!(summary)))
 }
 
-/// Deletes the record of a new training whose settings were refused before it wrote anything else, and the empty folder.
+/// Deletes the record of a new training, and the empty folder, if its settings were refused, or a file such as the cache of features
+/// could not be read or written, before it wrote anything else.
 fn withdraw(out: &Path, resume: bool, error: &Error) {
-    let lock = (!resume && error.is_usage()).then(|| Lock::folder(out).ok()).flatten();
+    let is_refused = error.is_usage() || matches!(error, Error::Io { .. });
+    let lock = (!resume && is_refused).then(|| Lock::folder(out).ok()).flatten();
     if lock.is_none() {
         return;
     }

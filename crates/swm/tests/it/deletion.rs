@@ -80,6 +80,24 @@ fn checkpoint_removal_keeps_files_of_the_user() {
 }
 
 #[test]
+fn checkpoint_behind_a_link_is_not_called_removed() {
+    let swm = Swm::new();
+    swm.json(DEMO);
+    let (run, outside) = (swm.path("demo/pldm-rooms"), swm.path("outside"));
+    fs::rename(run.join("checkpoint"), &outside).expect("moving the checkpoint");
+    for name in ["checkpoint", ".checkpoint.old"] {
+        std::os::unix::fs::symlink(&outside, run.join(name)).expect("making a link");
+        let named = format!("pldm-rooms/{name}");
+        swm.fails(&["checkpoints", "remove", "demo/pldm-rooms", "--yes"], 2, &[&named, "symbolic link"]);
+        assert!(run.join("train.jsonl").exists() && outside.join("weights.safetensors").exists());
+        fs::remove_file(run.join(name)).expect("removing the link");
+    }
+    fs::rename(&outside, run.join("checkpoint")).expect("moving the checkpoint back");
+    swm.json(&["checkpoints", "remove", "demo/pldm-rooms", "--yes"]);
+    assert!(!run.exists());
+}
+
+#[test]
 fn training_does_not_write_through_links() {
     let swm = Swm::new();
     swm.json(DEMO);

@@ -152,6 +152,28 @@ fn file_beyond_the_limit_of_the_process_is_an_error() {
 }
 
 #[test]
+fn datasets_are_not_called_damaged_for_lack_of_file_handles() {
+    let swm = Swm::new();
+    for name in ["rooms.lerobot", "rooms.lance-video"] {
+        swm.json(&["collect", "swm/TwoRoom-v1", "--image", "32", "--episodes", "2", "--max-steps", "4", "-o", name]);
+        let mut refused = 0;
+        for handles in (4..16).chain([64]) {
+            let inspect = ["inspect", name, "--checksum"].join(" ");
+            let command = format!("ulimit -n {handles}; exec {} {inspect}", env!("CARGO_BIN_EXE_swm"));
+            let mut shell = std::process::Command::new("sh");
+            let output = shell.args(["-c", &command]).current_dir(swm.path("")).output().expect("a shell");
+            let error = text(&output.stderr);
+            let is_named =
+                error.contains("Too many open files") && !error.contains("damaged") && !error.contains("install");
+            assert!(output.status.success() || is_named, "{name}, {handles} handles: {error}");
+            refused += usize::from(!output.status.success());
+            assert!(output.status.success() || handles < 64, "{name}: {error}");
+        }
+        assert!(refused > 0, "{name}: all limits were enough");
+    }
+}
+
+#[test]
 fn small_stacks_of_the_main_thread_are_enough() {
     let swm = Swm::new();
     for arguments in

@@ -108,10 +108,12 @@ fn wrong_content_is_refused_and_not_kept() {
 fn changed_files_of_the_cache_are_downloaded_again() {
     let setup = Setup::new();
     let large = content(5000);
-    let commit = setup.hub.commit("models/lab/rooms", &[("large", &large), ("small", b"hello"), ("none", b"hello")]);
+    // The last one has a folder of the name that the file of the user would get.
+    let files = [("large", &large[..]), ("small", b"hello"), ("none", b"hello"), ("small.changed/x", b"whole")];
+    let commit = setup.hub.commit("models/lab/rooms", &files);
     setup.hub.state().git_ids = [("small".to_owned(), "b6fc4c620b67d95f953a5c1c1230aaab5db5a1b0".to_owned())].into();
     let downloaded = || setup.json(&["pull", "hf://lab/rooms"], None)["downloaded"].as_u64();
-    assert_eq!(downloaded(), Some(5010));
+    assert_eq!(downloaded(), Some(5015));
     let repository = setup.cached("rooms");
     let snapshot = repository.join("snapshots").join(&commit);
     let record = repository.join("verified").join(format!("{commit}.json"));
@@ -139,7 +141,9 @@ fn changed_files_of_the_cache_are_downloaded_again() {
     assert!(said.contains("large.changed is the file that the download replaces"), "{said}");
     assert_eq!(std::fs::read(snapshot.join("large.changed")).expect("the user's file"), changed);
     assert_eq!(std::fs::read(snapshot.join("large")).expect("the file"), large);
-    assert_eq!(std::fs::read(snapshot.join("small")).expect("the file"), b"hello");
+    for (name, bytes) in [("small", b"hello"), ("small.changed/x", b"whole"), ("small.changed-2", b"hullo")] {
+        assert_eq!(std::fs::read(snapshot.join(name)).expect("the file"), bytes, "{name}");
+    }
     assert_eq!(downloaded(), Some(0));
     // A cache of an earlier build has no record, and is compared once.
     change();

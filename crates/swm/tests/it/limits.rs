@@ -107,6 +107,47 @@ fn run_without_memory_ends_with_an_error() {
     }
 }
 
+/// The threads that decode and hash are those of rayon's global pool, which panics where it cannot start them at its first use.
+#[cfg(target_os = "linux")]
+#[test]
+fn inspection_without_threads_ends_with_an_error() {
+    const STACK: usize = 1 << 30;
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "32", "--episodes", "2"]);
+    let inspect = ["inspect", "rooms", "--checksum", "--threads", "2"];
+    let outcomes = (0..16).chain([64]).map(|threads| {
+        let output = run_with_memory(&swm, &inspect, (threads * STACK + (STACK >> 1)) >> 10, &STACK.to_string());
+        let (code, error) = (output.status.code(), text(&output.stderr));
+        assert!(matches!(code, Some(0 | 1)), "{threads} threads: {:?}: {error}", output.status);
+        assert!(!error.contains("the command panicked"), "{threads} threads: {error}");
+        code
+    });
+    let outcomes: Vec<_> = outcomes.collect();
+    assert_eq!((outcomes[0], outcomes[16]), (Some(1), Some(0)), "{outcomes:?}");
+    // One thread is enough for a file of HDF5.
+    swm.json(&["convert", "rooms", "rooms.h5"]);
+    let inspect = ["inspect", "rooms.h5", "--checksum", "--threads", "64"];
+    let output = run_with_memory(&swm, &inspect, (4 * STACK + (STACK >> 1)) >> 10, &STACK.to_string());
+    assert!(output.status.success(), "{}", text(&output.stderr));
+}
+
+/// MuJoCo goes on with a null pointer, or ends the process, where an allocation of its own fails.
+#[cfg(target_os = "linux")]
+#[test]
+fn environment_of_mujoco_without_memory_ends_with_an_error() {
+    let swm = Swm::new();
+    for (env, most) in [("swm/HumanoidDMControl-v0", 400), ("swm/OGBCube-v0", 900)] {
+        let frame = ["frame", env, "-o", "frame.png", "--renderer", "cpu", "--threads", "1"];
+        for megabytes in (100..most).step_by(50).chain([4000]) {
+            let output = run_with_memory(&swm, &frame, megabytes << 10, "");
+            let (code, error) = (output.status.code(), text(&output.stderr));
+            assert!(matches!(code, Some(0 | 1)), "{env}, {megabytes} MB: {:?}: {error}", output.status);
+            assert!(code == Some(0) || error.contains("out of memory"), "{env}, {megabytes} MB: {error}");
+            assert!(code == Some(0) || megabytes < 4000, "{env} needs less: {error}");
+        }
+    }
+}
+
 /// A running command that gets signals. It is killed after five minutes, so that a test ends.
 #[cfg(target_os = "linux")]
 struct Running {
@@ -151,8 +192,14 @@ impl Running {
 
     /// Waits for a line of standard error.
     fn wait_for(&mut self, text: &str) {
-        let line = self.lines.find(|line| line.as_ref().is_ok_and(|line| line.contains(text)));
-        assert!(line.is_some(), "the program ended without '{text}'");
+        let mut said = vec![];
+        for line in self.lines.by_ref().map_while(Result::ok) {
+            if line.contains(text) {
+                return;
+            }
+            said.push(line);
+        }
+        panic!("the program ended without '{text}' ({:?}): {}", self.child.wait(), said.join("\n"));
     }
 
     /// The processor time of the program, in ticks of a hundredth of a second.

@@ -179,6 +179,26 @@ fn record_of_a_run_chooses_no_folder_that_is_written_to() {
 }
 
 #[test]
+fn cache_that_cannot_be_made_leaves_no_run() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--episodes", "12", "--image", "64", "--max-steps", "9"]);
+    let settings = ["schedule.steps=1", "schedule.warmup=0", "data.batch_size=8"];
+    let train = [&["train", "gcbc", "--preset", "keypoints", "--data", "rooms", "-o", "./run"][..], &settings].concat();
+    fs::write(swm.path("file"), "").expect("writing a file");
+    for cache in ["file", "file/cache"] {
+        swm.fails(&[&train[..], &["--feature-cache", cache]].concat(), 1, &[cache, "creating the cache's folder"]);
+        assert!(!swm.path("run").exists(), "{cache}");
+    }
+    swm.json(&train);
+    // Another run in the folder is refused before there is a cache.
+    swm.fails(&[&train[..], &["--feature-cache", "cache"]].concat(), 2, &["run"]);
+    assert!(!swm.path("cache").exists());
+    // A model without a fixed part has no features to keep.
+    let train = [&["train", "gcbc", "--preset", "tiny", "--data", "rooms", "-o", "./other"][..], &settings].concat();
+    swm.json(&[&train[..], &["--feature-cache", "file"]].concat());
+}
+
+#[test]
 fn results_on_a_server_open_no_connection() {
     let swm = Swm::new();
     swm.json(&[

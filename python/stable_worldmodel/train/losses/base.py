@@ -84,8 +84,8 @@ class Losses:
         raise NotImplementedError
 
     def actions(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """The actions `(N, T, A)` in the model's units; missing ones (NaN) are 0."""
-        action = batch["action"]
+        """The actions `(N, T, A)` in the model's units, of single precision; missing ones (NaN) are 0."""
+        action = batch["action"].float()
         return ((action - self.mean.to(action.device)) / self.std.to(action.device)).nan_to_num()
 
     def train_mode(self) -> None:

@@ -198,7 +198,8 @@ def tdmpc2_forward(self: Any, batch: dict[str, Any], stage: str, cfg: Any) -> di
     model, wm = self.model, setting(cfg, "wm")
     horizon, rho, gamma = int(setting(wm, "horizon")), float(setting(wm, "rho")), float(setting(wm, "discount", 0.99))
     latents = model.encode({key: batch[key] for key in model.encoding})
-    actions, rewards = batch["action"], batch["reward"].reshape(*batch["reward"].shape[:2], 1)
+    actions, rewards = (batch[name].to(latents.dtype) for name in ("action", "reward"))
+    rewards = rewards.reshape(*rewards.shape[:2], 1)
     z = latents[:, 0]
     losses = dict.fromkeys(("consist", "reward", "value", "policy"), z.new_zeros(()))
 

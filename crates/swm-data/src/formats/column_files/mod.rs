@@ -79,6 +79,18 @@ pub(crate) fn exists(folder: &Path) -> bool {
     column_path(folder, LENGTHS).is_file()
 }
 
+/// Checks that a folder contains `ep_len.npz`.
+///
+/// # Errors
+/// If it does not, or may not be read.
+pub(super) fn check_exists(folder: &Path) -> Result<()> {
+    if files::exists(&column_path(folder, LENGTHS))? {
+        return Ok(());
+    }
+    let problem = if files::exists(folder)? { "it holds no ep_len.npz" } else { "there is no such dataset" };
+    Err(Error::corrupt(folder, problem, "check the path; `swm datasets` lists the stored datasets"))
+}
+
 /// Returns whether a folder is empty, or contains only the first files of a writer that was killed, or whose disk was full, before its
 /// first commit: a part of an archive, and the first rows of no episodes.
 pub(super) fn has_no_dataset(folder: &Path) -> bool {

@@ -3,7 +3,7 @@
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash};
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, SUFFIXES, check_unchanged, exists, image_path, state_of};
+use crate::formats::column_files::{ColumnFiles, SUFFIXES, check_exists, check_unchanged, image_path, state_of};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,10 +26,7 @@ pub(super) struct FolderReader {
 
 impl FolderReader {
     pub fn open(folder: &Path) -> Result<Self> {
-        if !exists(folder) {
-            let problem = if folder.exists() { "it holds no ep_len.npz" } else { "there is no such dataset" };
-            return Err(Error::corrupt(folder, problem, "check the path; `swm datasets` lists the stored datasets"));
-        }
+        check_exists(folder)?;
         let files = ColumnFiles::open(folder)?;
         let images = match files.recorded() {
             Some(recorded) => recorded.columns().iter().filter(|column| column.is_image()).cloned().collect(),

@@ -276,7 +276,7 @@ impl Column {
             .map(|run| bounds(run))
             .map(|rows| address + rows.start * size..address + rows.end * size)
             .collect();
-        let fetched = source.fetch(&ranges).map_err(|e| e.to_string())?;
+        let fetched = source.fetch(&ranges, false).map_err(|e| e.to_string())?;
         runs.into_par_iter().enumerate().try_for_each(|(i, run)| {
             let first = row_of(run[0].0);
             if let Some(bytes) = fetched.get(i) {
@@ -326,7 +326,7 @@ impl Column {
             let rows = slots.chunk_by(same_chunks).map(|group| row_of(group[0].0) / grid.rows);
             ranges.extend(rows.flat_map(|row| index.row(row, grid)).map(Chunk::range));
         }
-        let fetched = source.fetch(&ranges).map_err(|e| e.to_string())?;
+        let fetched = source.fetch(&ranges, grid.rows > 1).map_err(|e| e.to_string())?;
         let fetched: HashMap<u64, Bytes> = ranges.iter().map(|range| range.start).zip(fetched).collect();
         let fetched = |chunk: &Chunk| fetched.get(&chunk.address);
         let groups: Vec<&mut [RowSlot<'_>]> = slots.chunk_by_mut(same_chunks).collect();

@@ -56,7 +56,8 @@ use crate::dataset::Location;
 use crate::formats::entry::{Backend, FormatEntry};
 use std::path::{Path, PathBuf};
 #[cfg(feature = "hdf5")]
-use swm_core::{Error, Result, files};
+use swm_core::Error;
+use swm_core::{Result, files};
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
@@ -79,7 +80,7 @@ const BACKEND: Option<Backend> = None;
 fn detect(location: &Location) -> bool {
     let folder = location.path().filter(|path| path.is_dir());
     ENTRY.has_suffix(location)
-        || folder.is_some_and(|path| !files_in(path).is_empty())
+        || folder.is_some_and(|path| files_in(path).is_ok_and(|files| !files.is_empty()))
         || location.path().is_some_and(has_signature)
 }
 
@@ -103,18 +104,17 @@ pub(super) const fn is_unfinished(_: &Path) -> bool {
 }
 
 /// The files in a folder with a suffix of this format, sorted by name.
-fn files_in(folder: &Path) -> Vec<PathBuf> {
-    let entries = folder.read_dir().into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut files: Vec<PathBuf> = entries.filter(|path| ENTRY.has_suffix(&path.into())).collect();
-    files.sort();
-    files
+fn files_in(folder: &Path) -> Result<Vec<PathBuf>> {
+    let mut files = files::entries(folder)?;
+    files.retain(|path| ENTRY.has_suffix(&path.into()));
+    Ok(files)
 }
 
 /// The file of a dataset: the location itself, or the only file in a folder, as in the reference implementation.
 #[cfg(feature = "hdf5")]
 fn file(location: &Location) -> Result<Location> {
     let Some(folder) = location.path().filter(|path| path.is_dir()) else { return Ok(location.clone()) };
-    match &files_in(folder)[..] {
+    match &files_in(folder)?[..] {
         [file] => Ok(Location::from(file)),
         [] => Err(Error::corrupt(folder, "it is a folder without .h5 files", "give the path of an .h5 file")),
         many => {

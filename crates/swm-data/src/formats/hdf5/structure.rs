@@ -1,8 +1,8 @@
 //! Calls of the crate `hdf5-pure`, which reads the structure of a file. Panics of the crate become errors.
 
-use crate::formats::guarded::guarded;
 use crate::formats::stored_scalar::{Class, StoredScalar};
 use hdf5_pure::{Datatype, DatatypeByteOrder, FloatingPointLayout};
+use swm_core::guarded::guarded;
 
 /// Calls `hdf5-pure`, which may panic on damaged files.
 pub(super) fn catch_panic<T, E: std::fmt::Display>(

@@ -1,6 +1,7 @@
 //! Errors of Lance and of object stores, in the words of this crate.
 
 use crate::dataset::objects::without_passwords;
+use crate::formats::system_error::system_error;
 use std::path::Path;
 use swm_core::Error;
 
@@ -20,12 +21,9 @@ pub fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Err
     // Lance takes damage for a fault of its own, and asks for a report.
     let text = without_position(text.split_once("/lance/issues. ").map_or(text.as_str(), |(_, found)| found));
     let text = without_kind(text);
-    // Lance converts some system errors to text, which still contains their code.
-    let code =
-        text.split("(os error ").nth(1).and_then(|rest| rest.split(')').next()).and_then(|number| number.parse().ok());
     let remote = label.to_str().is_some_and(|label| label.contains("://"));
-    match (code, error) {
-        (Some(code), _) if !remote => Error::io(label, action, std::io::Error::from_raw_os_error(code)),
+    match (system_error(text), error) {
+        (Some(error), _) if !remote => Error::io(label, action, error),
         (_, lance_core::Error::NotFound { uri, .. }) => damaged(label, format!("{action}: {uri} is missing")),
         (_, lance_core::Error::NotSupported { .. } | lance_core::Error::VersionConflict { .. }) => Error::corrupt(
             label,

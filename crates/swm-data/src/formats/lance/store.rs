@@ -175,8 +175,7 @@ impl Store {
     fn has_versions(&self) -> Result<bool> {
         if !self.remote {
             // A list of the store has no pipes, but Lance lists local versions itself.
-            let entries = std::fs::read_dir(self.label.join("_versions")).into_iter().flatten().flatten();
-            entries.into_iter().try_for_each(|entry| check_regular(&entry.path()))?;
+            files::entries(&self.label.join("_versions"))?.iter().try_for_each(|path| check_regular(path))?;
         }
         Ok(self.list("_versions")?.iter().any(|meta| meta.location.extension() == Some("manifest")))
     }

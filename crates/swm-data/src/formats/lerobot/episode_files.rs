@@ -57,7 +57,7 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         length: usize,
     }
     let path = root.join("meta").join("episodes.jsonl");
-    if !path.exists() {
+    if !files::exists(&path)? {
         return Err(damaged(root, "meta/episodes.jsonl is missing".to_owned()));
     }
     let text = String::from_utf8(files::read(&path, MAX_TEXT_BYTES)?)
@@ -98,13 +98,13 @@ fn video_file(root: &Path, info: &Info, key: &str, indices: &[(&str, usize)]) ->
 #[allow(clippy::too_many_lines, reason = "one block per column of the table")]
 fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     let folder = root.join("meta").join("episodes");
-    let mut files = vec![];
+    let mut tables = vec![];
     // The folder does not exist if there are no episodes yet.
-    for chunk in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
-        let entries = std::fs::read_dir(chunk.path()).into_iter().flatten().flatten().map(|entry| entry.path());
-        files.extend(entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "parquet")));
+    for chunk in files::entries(&folder)? {
+        let entries = files::entries(&chunk)?.into_iter();
+        tables.extend(entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "parquet")));
     }
-    files.sort();
+    tables.sort();
     let keys = info.video_keys();
     let mut columns: Vec<String> =
         ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index", CONSTANTS]
@@ -119,7 +119,7 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
     let mut files_of_episodes = vec![];
     let mut stated = Ranges::new(info.fps().unwrap_or(1.0));
-    for path in &files {
+    for path in &tables {
         // Ignores files that are not part of the dataset.
         if files_of_episodes.len() == info.total_episodes {
             break;

@@ -153,8 +153,8 @@ impl Info {
     /// If the file is missing or damaged, or the version is not supported.
     pub fn read(root: &Path) -> Result<Self> {
         let path = root.join("meta").join("info.json");
-        if !path.exists() {
-            let problem = if root.exists() { "it holds no meta/info.json" } else { "there is no such dataset" };
+        if !files::exists(&path)? {
+            let problem = if files::exists(root)? { "it holds no meta/info.json" } else { "there is no such dataset" };
             return Err(Error::corrupt(root, problem, "check the path; `swm datasets` lists the stored datasets"));
         }
         let bytes = files::read(&path, MAX_TEXT_BYTES)?;

@@ -1,7 +1,7 @@
 //! Reads and writes Parquet files.
 
 use super::info::damaged;
-use crate::formats::guarded::guarded;
+use crate::formats::system_error::system_error;
 use arrow_array::cast::AsArray as _;
 use arrow_array::types::{Int32Type, Int64Type};
 use arrow_array::{Array, RecordBatch};
@@ -16,6 +16,7 @@ use std::io::Write as _;
 use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
+use swm_core::guarded::guarded;
 use swm_core::{Error, Result, files};
 
 /// The most rows per byte of a file. A file of equal values, which are stored as runs, has a few thousand.
@@ -68,23 +69,28 @@ pub fn read_batches(
     row_bytes: usize,
     each: &mut dyn FnMut(RecordBatch) -> Result<()>,
 ) -> Result<()> {
-    if !path.exists() {
+    if !files::exists(path)? {
         return Err(damaged(path, "the file is missing".to_owned()));
     }
     let file = files::open(path)?;
     let length = file.metadata().map_err(|e| Error::io(path, "opening a table", e))?.len();
-    let failed = |e: &dyn std::fmt::Display| damaged(path, format!("the table is damaged: {e}"));
+    let broken = |problem: &dyn std::fmt::Display| damaged(path, format!("the table is damaged: {problem}"));
+    // The errors of the library, which reads the file.
+    let failed = |e: &dyn std::fmt::Display| match system_error(&e.to_string()) {
+        Some(error) => Error::io(path, "reading the table", error),
+        None => broken(e),
+    };
     let is_read = |name: &String| columns.contains(&name.as_str());
     let work = || -> Result<()> {
         // Ignores the Arrow schema that other programs embed, because it is redundant and could be damaged.
         let options = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
         let builder = ParquetRecordBatchReaderBuilder::try_new_with_options(file, options).map_err(|e| failed(&e))?;
-        let total = usize::try_from(builder.metadata().file_metadata().num_rows()).map_err(|e| failed(&e))?;
+        let total = usize::try_from(builder.metadata().file_metadata().num_rows()).map_err(|e| broken(&e))?;
         if total as u64 > MAX_ROWS_PER_BYTE.saturating_mul(length) {
-            return Err(failed(&format!("{total} rows do not fit {length} bytes")));
+            return Err(broken(&format!("{total} rows do not fit {length} bytes")));
         }
         if builder.metadata().row_groups().iter().flat_map(RowGroupMetaData::columns).any(is_outside) {
-            return Err(failed(&"a column begins before the file, or has a negative size"));
+            return Err(broken(&"a column begins before the file, or has a negative size"));
         }
         check_compression(path, builder.metadata().row_groups(), is_read)?;
         // Rows of the declared shape have fewer values than bytes.
@@ -94,22 +100,22 @@ pub fn read_batches(
             row_bytes > 0 && read.map(ColumnChunkMetaData::num_values).any(|values| values > most)
         };
         if builder.metadata().row_groups().iter().any(is_larger) {
-            return Err(failed(&"its rows have more values than the dataset declares"));
+            return Err(broken(&"its rows have more values than the dataset declares"));
         }
-        let column_indices = positions(builder.parquet_schema(), columns).map_err(|problem| failed(&problem))?;
+        let column_indices = positions(builder.parquet_schema(), columns).map_err(|problem| broken(&problem))?;
         let mask = ProjectionMask::roots(builder.parquet_schema(), column_indices);
         let mut builder =
             builder.with_projection(mask).with_batch_size((BATCH_BYTES / row_bytes.max(1)).clamp(1, ROWS));
         if let Some(rows) = rows {
             if rows.last().is_some_and(|range| range.end > total) {
-                return Err(failed(&format!("it has {total} rows")));
+                return Err(broken(&format!("it has {total} rows")));
             }
             builder = builder.with_row_selection(RowSelection::from_consecutive_ranges(rows.into_iter(), total));
         }
         let reader = builder.build().map_err(|e| failed(&e))?;
         reader.into_iter().try_for_each(|batch| each(batch.map_err(|e| failed(&e))?))
     };
-    guarded(work).unwrap_or_else(|panic| Err(failed(&panic)))
+    guarded(work).unwrap_or_else(|panic| Err(broken(&panic)))
 }
 
 /// The positions of columns in a table.

@@ -3,7 +3,7 @@
 use crate::dataset::Location;
 use crate::dataset::episodes::content_hash;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, check_unchanged, exists, state_of, video_path};
+use crate::formats::column_files::{ColumnFiles, check_exists, check_unchanged, state_of, video_path};
 use crate::formats::opened;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -27,10 +27,7 @@ pub(super) struct VideoReader {
 
 impl VideoReader {
     pub fn open(folder: &Path) -> Result<Self> {
-        if !exists(folder) {
-            let problem = if folder.exists() { "it holds no ep_len.npz" } else { "there is no such dataset" };
-            return Err(Error::corrupt(folder, problem, "check the path; `swm datasets` lists the stored datasets"));
-        }
+        check_exists(folder)?;
         let files = ColumnFiles::open(folder)?;
         let images = match files.recorded() {
             Some(recorded) => recorded.columns().iter().filter(|column| column.is_image()).cloned().collect(),

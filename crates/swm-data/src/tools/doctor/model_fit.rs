@@ -25,7 +25,7 @@ impl ModelFit {
         let mut missing = vec![];
         let images = schema.column(PIXELS).is_ok_and(ColumnSpec::is_image);
         let has = |name| schema.find(name).is_some();
-        let state = has(STATE) || has(OBSERVATION);
+        let state = [STATE, OBSERVATION].iter().any(|name| schema.column(name).is_ok_and(|column| !column.is_image()));
         match required.observations {
             RequiredObservations::Images if images => {}
             RequiredObservations::Images if has(PIXELS) => missing.push(format!("'{PIXELS}' holds no RGB images")),
@@ -93,6 +93,10 @@ mod tests {
         assert_eq!(missing(&all[..2], &[19]), [1, 1]);
         let states = [ColumnSpec::new(STATE, DType::Float64, [4]), action(DType::Float32), reward.clone()];
         assert_eq!(missing(&states, &[30]), [1, 0]);
+        let bytes = [ColumnSpec::new(STATE, DType::U8, [3]), action(DType::Float64), reward.clone()];
+        assert_eq!(missing(&bytes, &[30]), [1, 0]);
+        let frames = [ColumnSpec::image(STATE, 8, 8), action(DType::Float32), reward.clone()];
+        assert_eq!(missing(&frames, &[30]), [1, 1]);
         assert_eq!(missing(&[pixels, action(DType::Int64), reward], &[30]), [1, 1]);
         let schema = Schema::new(states.to_vec()).expect("creating the schema");
         assert_eq!(ModelFit::new(&world_model, &schema, &[30]).missing, ["there are no images ('pixels')"]);

@@ -84,8 +84,8 @@ impl Session for PlanSession<'static> {
 
     fn kind(request: &Request) -> Kind {
         match request {
-            Request::Shown => Kind::Shown,
-            Request::Enough => Kind::EndsSearch,
+            Request::Shown {} => Kind::Shown,
+            Request::Enough {} => Kind::EndsSearch,
             _ => Kind::Ordered,
         }
     }
@@ -202,9 +202,9 @@ impl<'a> PlanSession<'a> {
             }
             Request::Settings { planner } => self.plan_with(&planner),
             Request::Decode { dataset } => self.decode(dataset),
-            Request::Decide => self.go_on(Mode::Deciding),
+            Request::Decide {} => self.go_on(Mode::Deciding),
             Request::Play { on } => self.go_on(if on { Mode::Playing } else { Mode::Paused }),
-            Request::Step => {
+            Request::Step {} => {
                 self.mode = Mode::Paused;
                 self.step()
             }
@@ -224,12 +224,12 @@ impl<'a> PlanSession<'a> {
                 self.out.reply(&Reply::Peeked { node, jpeg });
                 Ok(())
             }
-            Request::Forget => {
+            Request::Forget {} => {
                 self.tree.forget_others();
                 self.send_tree();
                 Ok(())
             }
-            Request::Enough | Request::Shown => Ok(()),
+            Request::Enough {} | Request::Shown {} => Ok(()),
         }
     }
 

@@ -2,7 +2,7 @@
 
 use super::agent::Agent;
 use super::map::{Map, TELEPORT_RADIUS, UNIT, center};
-use crate::physics::compile_spec;
+use crate::physics::{COMPILATION_BYTES, compile_spec};
 use crate::{assets, link};
 use mujoco_rs::mujoco_c::_mjtGeomBase::{self, mjGEOM_BOX, mjGEOM_CYLINDER};
 use mujoco_rs::wrappers::MjModel;
@@ -23,7 +23,7 @@ const WHITE_GEOMS: [&str; 3] = ["aux_1_geom", "left_leg_geom", "left_ankle_geom"
 /// # Errors
 /// When MuJoCo or the files of OGBench are not installed, or MuJoCo rejects them.
 pub fn compile(agent: Agent, map: &Map, pixels: bool) -> Result<MjModel> {
-    link::load()?;
+    link::load_to_compile(COMPILATION_BYTES)?;
     let path = assets::path("ogbench")?.join("ogbench/locomaze/assets").join(agent.file());
     let failed =
         |error: &dyn std::fmt::Display| Error::external(format!("building a maze of {}", path.display()), error);

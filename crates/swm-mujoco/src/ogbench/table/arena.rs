@@ -27,6 +27,9 @@ const GAINS: [(f64, f64); 6] =
 /// The time step, in seconds.
 const TIMESTEP: f64 = 0.002;
 
+/// The memory that MuJoCo takes at most to compile the table with the arm's meshes.
+const COMPILATION_BYTES: usize = 400 << 20;
+
 /// The materials that are transparent with `ob_type=pixels`, and their alpha.
 const TRANSPARENT_MATERIALS: [(&str, f32); 9] = [
     ("ur5e/robotiq/metal", 0.1),
@@ -54,7 +57,7 @@ pub enum ArmRendering {
 /// # Errors
 /// When MuJoCo or the files of OGBench are not installed, or MuJoCo rejects them.
 pub fn compile(config: &TableConfig, arm_rendering: ArmRendering) -> Result<MjModel> {
-    link::load()?;
+    link::load_to_compile(COMPILATION_BYTES)?;
     let files = Files(assets::path("ogbench")?.join("ogbench/manipspace/descriptions"));
     let mut arena = files.read("floor_wall.xml")?;
     set_options(&mut arena);

@@ -1,9 +1,9 @@
 //! [`guarded`]: calls of libraries that panic when a file is damaged.
 
+use crate::Error;
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind, set_hook, take_hook};
 use std::sync::Once;
-use swm_core::Error;
 
 thread_local! {
     /// Whether this thread is in a guarded call.
@@ -11,7 +11,10 @@ thread_local! {
 }
 
 /// Calls `code`. A panic becomes an error with its text, and is not printed: for the user it means that a file is damaged.
-pub(super) fn guarded<T>(code: impl FnOnce() -> T) -> Result<T, String> {
+///
+/// # Errors
+/// The text of the panic.
+pub fn guarded<T>(code: impl FnOnce() -> T) -> Result<T, String> {
     static QUIET: Once = Once::new();
     QUIET.call_once(|| {
         let print = take_hook();

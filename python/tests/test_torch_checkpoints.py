@@ -428,6 +428,24 @@ def test_pickled_code_of_weights_does_not_run(home, tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.parametrize("name", ["weights.pt", "run.ckpt"])
+def test_every_changed_bit_of_an_archive_is_refused_or_harmless(tmp_path, name):
+    torch.save({"weight": torch.arange(300.0)}, tmp_path / name)
+    content, file = (tmp_path / name).read_bytes(), tmp_path / f"changed-{name}"
+    begin = zipfile.ZipFile(tmp_path / name).start_dir
+    for position in (*range(0, 64), *range(begin, len(content))):
+        for bit in range(8):
+            changed = bytearray(content)
+            changed[position] ^= 1 << bit
+            file.write_bytes(changed)
+            try:
+                found = _weights.read_state_dict(file)
+            except RuntimeError as error:
+                assert str(file) in str(error), (position, bit)
+            else:
+                assert torch.equal(found["weight"], torch.arange(300.0)), (position, bit)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "kind"),
     [

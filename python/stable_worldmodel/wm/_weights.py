@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import pickle
@@ -26,6 +27,9 @@ _TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", 
 _WITH_NAN = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 #: The largest header of a file, in bytes.
 _MAX_HEADER = 100_000_000
+
+#: The attribute of a member of an archive that is a folder, and the flag of one that is encrypted.
+_FOLDER, _ENCRYPTED = 0x10, 0x1
 
 #: Parts of the weight names of a vision transformer: in `transformers` 5, then as published.
 _NEWER = (
@@ -111,7 +115,7 @@ def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     try:
         found: Any = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        if isinstance(error, OSError) or lacks_memory(error):
+        if _is_of_system(error) or lacks_memory(error):
             raise
         named = re.search(r"GLOBAL (\S+)", str(error)) if isinstance(error, pickle.UnpicklingError) else None
         if named is not None:
@@ -168,9 +172,9 @@ def check_archive(path: str | os.PathLike[str]) -> None:
     Raises:
         RuntimeError: If a member is compressed or damaged.
     """
-    if not zipfile.is_zipfile(path):
-        return
     try:
+        if not zipfile.is_zipfile(path):
+            return
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
             if len(set(names)) < len(names):
@@ -179,12 +183,24 @@ def check_archive(path: str | os.PathLike[str]) -> None:
             for member in archive.infolist():
                 if member.compress_type != zipfile.ZIP_STORED:
                     raise RuntimeError(f"{path}: {member.filename!r} is compressed; expected a file that torch.save wrote")
+                # Of such members, torch reads nothing, and returns what was in the memory before.
+                plain = not (member.external_attr & _FOLDER or member.flag_bits & _ENCRYPTED)
+                if not plain or member.compress_size != member.file_size:
+                    problem = f"{member.filename!r} is not stored as a plain file"
+                    raise RuntimeError(f"{path}: {problem}; get the file again from where it comes from")
             # torch can leave out the checksums (`torch.serialization.set_crc32_options`).
             damaged = archive.testzip() if any(member.CRC for member in archive.infolist()) else None
-    except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as error:
+    except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError, OSError) as error:
+        if _is_of_system(error):
+            raise
         raise RuntimeError(f"{path}: it is damaged ({error}); get it again from where it comes from") from error
     if damaged is not None:
         raise RuntimeError(f"{path}: {damaged!r} is damaged, its checksum differs; get the file again from where it comes from")
+
+
+def _is_of_system(error: Exception) -> bool:
+    """Whether the system could not read a file. Positions that no file has are those of a damaged archive."""
+    return isinstance(error, OSError) and error.errno != errno.EINVAL
 
 
 def load_into(model: nn.Module, weights: Mapping[str, Tensor], source: str) -> None:

@@ -173,17 +173,19 @@ impl Running {
         Self { child, lines, _ended }
     }
 
-    /// Waits until the program handles interrupts, bit 1 of the mask of handled signals.
+    /// Whether the mask of signals has this number.
+    fn has(&self, mask: &str, signal: u32) -> bool {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("a process");
+        let mask = status.lines().find_map(|line| line.strip_prefix(mask)).expect("a mask of signals");
+        u64::from_str_radix(mask.trim(), 16).expect("a number") >> (signal - 1) & 1 == 1
+    }
+
+    /// Waits until the program handles interrupts.
     fn wait_for_handler(&self) {
         let handles_interrupts = || {
-            let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("a process");
-            let mask = |name: &str| {
-                let mask = status.lines().find_map(|line| line.strip_prefix(name)).expect("a mask of signals");
-                u64::from_str_radix(mask.trim(), 16).expect("a number")
-            };
             // Shells start jobs in the background of scripts so, and the program leaves it.
-            assert_eq!(mask("SigIgn:") & 2, 0, "the tests run where SIGINT is ignored");
-            mask("SigCgt:") & 2 > 0
+            assert!(!self.has("SigIgn:", 2), "the tests run where SIGINT is ignored");
+            self.has("SigCgt:", 2)
         };
         while !handles_interrupts() {
             std::thread::yield_now();
@@ -248,15 +250,20 @@ fn first_signal_stops_a_benchmark() {
 fn second_signal_ends_the_program() {
     let swm = Swm::new();
     let solver = ["--solver", "cem,samples=100000,iterations=100000", "--budget", "3"];
-    for (signal, code) in [("INT", 130), ("TERM", 143), ("HUP", 129)] {
+    for (signal, code) in [("INT", 130_u32), ("TERM", 143), ("HUP", 129)] {
         let args = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--image", "32", "--episodes", "1"];
         let mut running = Running::start(&swm, &[&args[..], &solver].concat());
         running.wait_for("evaluate: random");
+        if running.has("SigIgn:", code - 128) {
+            // The tests run so, under nohup or in the background of a script, and the program leaves it.
+            running.signal("KILL");
+            continue;
+        }
         // The plan has begun then, whatever the load of the machine.
         running.wait_for_work();
         running.signal(signal);
         running.wait_for("stopping at the next safe point");
         running.signal(signal);
-        assert_eq!(running.end(), Some(code), "{signal}");
+        assert_eq!(running.end(), i32::try_from(code).ok(), "{signal}");
     }
 }

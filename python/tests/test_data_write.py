@@ -432,6 +432,19 @@ def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, m
     for i in range(7):
         np.testing.assert_array_equal(own.load_episode(i)["state"], native.load_episode(i)["state"])
 
+    with pytest.raises(FileExistsError, match="do not resume; use mode='overwrite'"):
+        data.convert(tmp_path / "b.lance", tmp_path / "a.npzs", progress=False)
+    with pytest.raises(ValueError, match="convert: codec, least_psnr: the format 'npz' is user-defined"):
+        data.convert(tmp_path / "b.lance", tmp_path / "c.npzs", codec="jpeg", least_psnr=30, progress=False)
+    for mode, count in (("resume", 7), ("append", 14)):
+        data.convert(tmp_path / "b.lance", tmp_path / "c.npzs", mode=mode, progress=False)
+        assert len(data.load_dataset(tmp_path / "c.npzs").lengths) == count
+    # The writer adds to the folder, whatever the mode.
+    with pytest.raises(
+        RuntimeError, match="was given 7 episodes of 49 rows, and stored 21 episodes of 147 rows; correct the writer"
+    ):
+        data.convert(tmp_path / "b.lance", tmp_path / "c.npzs", mode="overwrite", progress=False)
+
     def unreadable(path, **kwargs):
         raise NotImplementedError("the format cannot be read")
 

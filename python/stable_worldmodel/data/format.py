@@ -200,7 +200,7 @@ def foreign_episodes(path: str | os.PathLike[str], format: str | None, mode: str
         return len(kind.open_reader(path).lengths)
     except Exception as error:
         # A dataset that is there may lack a file of its own.
-        if isinstance(error, FileNotFoundError) if "://" in text else _is_free(text):
+        if isinstance(error, FileNotFoundError) if "://" in text else is_free(text):
             return 0
         why = f"{text}: the reader of the format {kind.name!r} does not tell the number of episodes ({error})"
         if mode == "resume":
@@ -209,7 +209,7 @@ def foreign_episodes(path: str | os.PathLike[str], format: str | None, mode: str
         return 0
 
 
-def _is_free(path: str) -> bool:
+def is_free(path: str) -> bool:
     """Whether a local path has nothing, or an empty folder."""
     return not os.path.exists(path) or (os.path.isdir(path) and not os.listdir(path))
 

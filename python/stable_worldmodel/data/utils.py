@@ -17,7 +17,7 @@ from stable_worldmodel import _engine, _files
 from . import _tensors
 from .dataset import Transform
 from .foreign import check_overrides, engine_of, left_out
-from .format import FORMATS, detect_format, get_format, validate_write_mode
+from .format import FORMATS, Format, detect_format, get_format, is_free, validate_write_mode
 from .normalization import column_normalizer
 from .writer import codec_json
 
@@ -212,7 +212,9 @@ def convert(
 ) -> dict[str, Any]:
     """Writes a dataset in another format or codec, and compares the decoded contents.
 
-    A conversion from or to a user-defined format leaves out texts and values of episodes, with a warning that names them.
+    A conversion from or to a user-defined format leaves out texts and values of episodes, with a warning that names them. One
+    to a user-defined format neither resumes nor chooses a codec, and compares the lengths of the episodes alone, if the format
+    has a reader.
 
         convert("pusht.lance", "pusht.h5")
         convert("pusht.lance", "pusht-video", dest_format="video")
@@ -242,6 +244,7 @@ def convert(
 
     Raises:
         TypeError: If a subclass of an open dataset that the engine reads overrides how it is read, such as `load_episode`.
+        RuntimeError: If the target has other contents than the source.
     """
     if isinstance(source, (str, os.PathLike)):
         source = load_dataset(source, cache_dir, source_format)
@@ -251,9 +254,22 @@ def convert(
     kind = FORMATS["lance"] if kind is None else kind
     report = _progress_callback(progress)
     if not kind.native:
+        given = {"codec": codec, "jpeg_quality": jpeg_quality, "least_psnr": least_psnr}
+        if refused := [name for name, value in given.items() if value is not None]:
+            problem = f"the format {kind.name!r} is user-defined, and its writer decides how images are stored"
+            raise ValueError(f"convert: {', '.join(refused)}: {problem}; leave it out, or give an argument of that writer")
+        if mode == "resume" and "://" not in os.fspath(dest) and not is_free(os.fspath(dest)):
+            problem = f"conversions to the user-defined format {kind.name!r} do not resume"
+            raise FileExistsError(
+                f"{os.fspath(dest)}: there is a dataset already, and {problem}; use mode='overwrite' or 'append'"
+            )
+        before = (_lengths(kind, dest) or []) if verify and mode == "append" else []
         with left_out() as names:
             written = write_all(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report, names)
         _warn_left_out(dest, names)
+        if verify:
+            found = _lengths(kind, dest)
+            _check_lengths(source, dest, kind, None if found is None else found[len(before) :])
         return written
     if kind.name in ("video", "lance-video"):
         # Frames have no time; videos of datasets have a fixed rate.
@@ -265,6 +281,29 @@ def convert(
         written = dict(json.loads(_engine.convert(engine_of(source), os.fspath(dest), options, report)))
     _warn_left_out(dest, names)
     return written
+
+
+def _lengths(kind: type[Format], path: str | os.PathLike[str]) -> list[int] | None:
+    """The lengths of the episodes of a user-defined format; `None` if the format has no reader."""
+    if "://" not in os.fspath(path) and is_free(os.fspath(path)):
+        return []
+    try:
+        return [int(length) for length in kind.open_reader(path).lengths]
+    except NotImplementedError:
+        return None
+
+
+def _check_lengths(source: Any, dest: str | os.PathLike[str], kind: type[Format], found: list[int] | None) -> None:
+    """Checks the lengths of the episodes that a writer stored against those of the source.
+
+    Raises:
+        RuntimeError: If they differ.
+    """
+    expected = [int(length) for length in engine_of(source).lengths()]
+    if found is not None and found != expected:
+        given, stored = (f"{len(lengths)} episodes of {sum(lengths)} rows" for lengths in (expected, found))
+        problem = f"its writer was given {given}, and stored {stored}"
+        raise RuntimeError(f"{os.fspath(dest)}: {problem}; correct the writer of the format {kind.name!r}, or use verify=False")
 
 
 def _warn_left_out(dest: str | os.PathLike[str], names: set[str]) -> None:

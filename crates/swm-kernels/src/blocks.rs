@@ -65,8 +65,12 @@ mod tests {
             for (i, value) in blocks.iter().enumerate() {
                 let (row, feature) = (i / (features * BLOCK) * BLOCK + i % BLOCK, i / BLOCK % features);
                 let written = (first..first + width).contains(&feature);
-                let expected = if row < rows { (row * width + feature.wrapping_sub(first)) as f32 + 1.0 } else { 0.0 };
-                assert_eq!(*value, if written { expected } else { -1.0 }, "row {row}, feature {feature}");
+                let expected = match (written, row < rows) {
+                    (false, _) => -1.0,
+                    (true, true) => (row * width + feature - first) as f32 + 1.0,
+                    (true, false) => 0.0,
+                };
+                assert_eq!(*value, expected, "row {row}, feature {feature}");
             }
         }
     }

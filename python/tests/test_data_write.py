@@ -439,6 +439,17 @@ def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, m
     for mode, count in (("resume", 7), ("append", 14)):
         data.convert(tmp_path / "b.lance", tmp_path / "c.npzs", mode=mode, progress=False)
         assert len(data.load_dataset(tmp_path / "c.npzs").lengths) == count
+    # A name that is no path, and a format without a reader.
+    stored, reader, writer = tmp_path / "named.npzs", numpy_format.open_reader, numpy_format.open_writer
+    with monkeypatch.context() as named:
+        named.setattr(numpy_format, "open_reader", lambda path, **kwargs: reader(stored, **kwargs))
+        named.setattr(numpy_format, "open_writer", lambda path, **kwargs: writer(stored, **kwargs))
+        for mode, count in (("error", 7), ("append", 14)):
+            data.convert(tmp_path / "b.lance", "a name", dest_format="npz", mode=mode, progress=False)
+            assert len(reader(stored).lengths) == count
+    with monkeypatch.context() as written:
+        written.delattr(numpy_format, "open_reader")
+        data.convert(tmp_path / "b.lance", tmp_path / "d.npzs", progress=False)
     # The writer adds to the folder, whatever the mode.
     with pytest.raises(
         RuntimeError, match="was given 7 episodes of 49 rows, and stored 21 episodes of 147 rows; correct the writer"

@@ -258,7 +258,7 @@ def convert(
         if refused := [name for name, value in given.items() if value is not None]:
             problem = f"the format {kind.name!r} is user-defined, and its writer decides how images are stored"
             raise ValueError(f"convert: {', '.join(refused)}: {problem}; leave it out, or give an argument of that writer")
-        if mode == "resume" and "://" not in os.fspath(dest) and not is_free(os.fspath(dest)):
+        if mode == "resume" and not is_free(os.fspath(dest)):
             problem = f"conversions to the user-defined format {kind.name!r} do not resume"
             raise FileExistsError(
                 f"{os.fspath(dest)}: there is a dataset already, and {problem}; use mode='overwrite' or 'append'"
@@ -285,12 +285,15 @@ def convert(
 
 def _lengths(kind: type[Format], path: str | os.PathLike[str]) -> list[int] | None:
     """The lengths of the episodes of a user-defined format; `None` if the format has no reader."""
-    if "://" not in os.fspath(path) and is_free(os.fspath(path)):
-        return []
     try:
         return [int(length) for length in kind.open_reader(path).lengths]
     except NotImplementedError:
         return None
+    except Exception:
+        # A target may be no path: the reader is asked first.
+        if is_free(os.fspath(path)):
+            return []
+        raise
 
 
 def _check_lengths(source: Any, dest: str | os.PathLike[str], kind: type[Format], found: list[int] | None) -> None:

@@ -166,7 +166,8 @@ fn dtype_and_shape(value: &Bound<'_, PyAny>) -> Option<(DType, Vec<usize>)> {
 
 /// Copies the elements of a `float32` array, which must have the given shape. `what` names the array in errors.
 pub fn f32_values(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyResult<Vec<f32>> {
-    let mut values = vec![0.0; shape.iter().product()];
+    // As many as the array has, because nothing has compared its shape yet.
+    let mut values = vec![0.0; given.cast::<PyArrayDyn<f32>>().map_or(0, |array| array.len())];
     copy_f32(what, given, shape, &mut values)?;
     Ok(values)
 }

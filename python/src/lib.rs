@@ -71,7 +71,7 @@ mod _engine {
     #[pymodule_export]
     use super::policy::Actor;
     #[pymodule_export]
-    use super::solver::solve;
+    use super::solver::{check_plan, solve};
     #[pymodule_export]
     use super::study::{studies, study_export, study_results};
     #[pymodule_export]

@@ -5,6 +5,7 @@ use crate::exit;
 use crate::warnings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
+use std::ffi::OsString;
 
 /// The ids of the native environments.
 #[pyfunction]
@@ -47,8 +48,9 @@ pub fn formats() -> Vec<&'static str> {
 
 /// The home folder, which holds the datasets and checkpoints that are given by name.
 #[pyfunction]
-pub fn home() -> PyResult<String> {
-    Ok(swm::home::home().map_err(to_py_err)?.display().to_string())
+pub fn home() -> PyResult<OsString> {
+    // What is not UTF-8 becomes what `os.fsdecode` makes of it.
+    Ok(swm::home::home().map_err(to_py_err)?.into_os_string())
 }
 
 /// Runs the command line with these arguments (the program's name first) and returns its exit code.

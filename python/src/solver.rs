@@ -14,7 +14,7 @@ use serde_json::Value;
 use std::time::{Duration, Instant};
 use swm::core::run::Control;
 use swm::core::{Error, Key, PlanProblem, PlanSpace, SearchObserver, Solver};
-use swm::plan::{BetweenIterations, SOLVERS};
+use swm::plan::{BetweenIterations, MpcConfig, SOLVERS};
 
 /// Runs `work` on the current thread, as a member of a thread pool.
 ///
@@ -39,6 +39,16 @@ pub fn on_this_thread<T: Send>(work: impl FnOnce() -> T + Send) -> T {
 pub fn make(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
     let settings: Value = json("solver settings", settings)?;
     (SOLVERS.get(solver).map_err(to_py_err)?.make)(&settings).map_err(to_py_err)
+}
+
+/// Checks the sizes of a plan, before Python allocates by them.
+///
+/// # Errors
+/// `ValueError` for a size that [`MpcConfig::check`] refuses.
+#[pyfunction]
+pub fn check_plan(horizon: usize, action_block: usize, history: usize) -> PyResult<()> {
+    let config = MpcConfig { horizon, receding_horizon: 1, action_block, history, ..MpcConfig::default() };
+    config.check().map_err(to_py_err)
 }
 
 /// Plans for every row of `infos`, with the random key `(seed, call, row)`, or `(seed, episode, plan)` if `plans` has the key of the

@@ -64,7 +64,7 @@ class HistoryBuffer:
 
         Args:
             n: The number of model steps.
-            env_ids: The environments, B of them; all for `None`.
+            env_ids: The indices of the environments, B of them, or a mask `(n_envs,)` of booleans; all for `None`.
 
         Returns:
             Columns `(B, k)` of values `(n_envs,)`, `(B, k * T, ..)` of values `(n_envs, T, ..)`, and with an action block
@@ -72,7 +72,9 @@ class HistoryBuffer:
             has no step, or `n` is less than 1.
 
         Raises:
-            ValueError: If the steps differ in their columns, or in the shapes of a column.
+            TypeError: If `env_ids` are neither indices nor a mask.
+            ValueError: If an environment does not exist, or a mask has another length. If the steps differ in their columns, or
+                in the shapes of a column.
         """
         envs = self._envs(env_ids)
         count = min(int(n), self.num_strided(envs))
@@ -80,7 +82,7 @@ class HistoryBuffer:
             return None
         blocks = min(int(n), min(len(self._steps[env]) for env in envs) // self.action_block)
         found: dict[str, Any] = {}
-        for key in self._steps[envs[0]][-1]:
+        for key in self._columns(envs, max(1 + (count - 1) * self.action_block, blocks * self.action_block)):
             try:
                 if key in self.block_keys and self.action_block > 1:
                     found[key] = _stack([self._blocks(env, key, blocks) for env in envs])
@@ -97,12 +99,22 @@ class HistoryBuffer:
         return found
 
     def reset(self, env_ids: Sequence[int] | None = None) -> None:
-        """Forgets the steps of these environments; of all of them for `None`."""
+        """Forgets the steps of these environments, indices or a mask as for `get`; of all of them for `None`."""
         for env in self._envs(env_ids):
             self._steps[env].clear()
 
-    def _envs(self, env_ids: Sequence[int] | None) -> list[int]:
-        return list(range(self.n_envs)) if env_ids is None else [int(env) for env in env_ids]
+    def _envs(self, env_ids: Any) -> list[int]:
+        if env_ids is None:
+            return list(range(self.n_envs))
+        given = env_ids.detach().cpu() if hasattr(env_ids, "detach") else env_ids
+        envs = _options.indices("HistoryBuffer: env_ids", given, self.n_envs)
+        if envs and max(envs) >= self.n_envs:
+            raise ValueError(f"HistoryBuffer: env_ids: {max(envs)}; expected indices from 0 to {self.n_envs - 1}")
+        return envs
+
+    def _columns(self, envs: Sequence[int], steps: int) -> list[str]:
+        """The columns that any of the last `steps` steps of these environments has."""
+        return list(dict.fromkeys(key for env in envs for step in list(self._steps[env])[-steps:] for key in step))
 
     def _strided(self, env: int, key: str, count: int) -> Any:
         steps = self._steps[env]

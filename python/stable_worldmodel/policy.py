@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import _engine, _options
+from ._action_spaces import single
 from ._overrides import engine_part, is_overridden
 from .buffer import HistoryBuffer
 from .data.normalization import ZScoreScaler
 from .planning.adapter import has_torch, prepared
-from .planning.solver.engine import ACTION_SCALER, PLANS, EngineSolver, NotConfigured, single
+from .planning.solver.engine import ACTION_SCALER, PLANS, EngineSolver, NotConfigured
 
 if TYPE_CHECKING:
     from .world import World
@@ -46,7 +47,7 @@ class PlanConfig:
     """The length of a plan and the number of steps that are executed before planning again.
 
     Attributes:
-        horizon: Model steps to plan.
+        horizon: Model steps to plan; solvers of the engine accept at most 10,000, as for the other numbers of steps.
         receding_horizon: Model steps to execute before planning again; a value equal to `horizon` is open loop.
         history_len: The number of frames that the model gets, including the current frame.
         action_block: Environment steps in one model step (the frameskip that the model was trained with).
@@ -567,6 +568,10 @@ class MPCPolicy(BasePolicy):
             raise ValueError(
                 f"{type(self.solver).__name__}.solve: got actions of shape {plan.shape}, expected "
                 f"({len(due)}, {self.cfg.horizon}, dimension of a model step)"
+            )
+        if plan.dtype.kind == "c":
+            raise ValueError(
+                f"{type(self.solver).__name__}.solve: expected real actions, got complex numbers; give their real part"
             )
         if not np.isfinite(plan).all():
             raise ValueError(f"{type(self.solver).__name__}.solve: expected finite actions, got a plan with NaN or infinity")

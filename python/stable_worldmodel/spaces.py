@@ -53,9 +53,18 @@ class _Factor:
         self._value = _copied(self._init_value)
 
     def _typed(self, value: Any) -> Any:
-        """The value in the type of the space, unless the conversion to integers is inexact."""
-        typed = np.asarray(value, dtype=self.dtype)  # type: ignore[attr-defined]
-        return typed if np.array_equal(typed, np.asarray(value)) or typed.dtype.kind == "f" else np.asarray(value)
+        """The value in the type of the space, unless the conversion to integers is inexact, or a finite value is too large."""
+        try:
+            with np.errstate(over="ignore"):
+                typed = np.asarray(value, dtype=self.dtype)  # type: ignore[attr-defined]
+        except OverflowError:
+            return np.asarray(value)
+        if typed.dtype.kind == "f":
+            infinite = np.isinf(typed)
+            fits = not infinite.any() or np.isinf(np.asarray(value, dtype=np.float64)[infinite]).all()
+        else:
+            fits = np.array_equal(typed, np.asarray(value))
+        return typed if fits else np.asarray(value)
 
     @property
     def init_value(self) -> Any:

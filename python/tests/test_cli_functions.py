@@ -1,5 +1,7 @@
 """Tests of the commands as functions."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -23,6 +25,18 @@ def test_listings_print_what_the_command_prints(capfd):
     assert capfd.readouterr().out.strip() == swm.__version__
     with pytest.raises(SystemExit):
         cli.fovs("swm/TwoRooom-v1")
+
+
+def test_the_home_folder_is_a_folder_on_this_machine(tmp_path, monkeypatch):
+    odd = os.fsdecode(b"/nowhere/n\xffu")
+    monkeypatch.setenv("STABLEWM_HOME", odd)
+    assert swm.utils.home() == odd
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("STABLEWM_HOME", "~/worlds")
+    assert swm.utils.home() == str(tmp_path / "worlds")
+    monkeypatch.setenv("STABLEWM_HOME", "s3://bucket/worlds")
+    with pytest.raises(ValueError, match="STABLEWM_HOME.*is a URI"):
+        swm.utils.home()
 
 
 def test_checkpoints_are_filtered(home, capfd):

@@ -212,6 +212,10 @@ def test_concatenated_and_merged_datasets_have_all_clips_and_columns(tmp_path):
         same(found, clip, True)
     same(both[-1], expected[-1], True)
     np.testing.assert_array_equal(both.get_row_data([17])["state"][0], second[0]["state"][0])
+    none, rows = both.get_row_data([]), parts[0].get_row_data([])
+    assert {name: (value.shape, value.dtype) for name, value in none.items()} == {
+        name: (value.shape, value.dtype) for name, value in rows.items()
+    }
     assert [len(chunk["state"]) for chunk in both.load_chunk([2, 0], [0, 0], [4, 8])] == [2, 4]
     assert both.lengths.tolist() == [8, 9, 7] and both.get_col_data("reward").shape == (24, 1)
 

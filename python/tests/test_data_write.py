@@ -2,14 +2,17 @@
 
 import json
 import pickle
+import re
 import signal
 import subprocess
 import sys
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -432,7 +435,7 @@ def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, m
     for i in range(7):
         np.testing.assert_array_equal(own.load_episode(i)["state"], native.load_episode(i)["state"])
 
-    with pytest.raises(FileExistsError, match="do not resume; use mode='overwrite'"):
+    with pytest.raises(FileExistsError, match="do not resume; add to it"):
         data.convert(tmp_path / "b.lance", tmp_path / "a.npzs", progress=False)
     with pytest.raises(ValueError, match="convert: codec, least_psnr: the format 'npz' is user-defined"):
         data.convert(tmp_path / "b.lance", tmp_path / "c.npzs", codec="jpeg", least_psnr=30, progress=False)
@@ -463,7 +466,7 @@ def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, m
         raise FileNotFoundError(f"{path}/lengths.npy")
 
     # The user's writer would add to the folder, whatever the mode.
-    with pytest.raises(FileExistsError, match="there is a dataset already; continue it"):
+    with pytest.raises(FileExistsError, match="there is a dataset already; add to it"):
         collected(tmp_path / "a.npzs", "error", 1)
     monkeypatch.setattr(numpy_format, "open_reader", incomplete)
     with pytest.raises(ValueError, match="does not tell the number of episodes .*lengths.npy.*cannot resume"):
@@ -475,6 +478,219 @@ def test_collection_in_a_user_defined_format_continues(tmp_path, numpy_format, m
         collected(tmp_path / "a.npzs", "resume", 9)
     with pytest.warns(UserWarning, match="starts again with its first episode; use another seed"):
         collected(tmp_path / "a.npzs", "append", 1)
+
+
+class Given:
+    """A reader of the user with given lengths and episodes."""
+
+    def __init__(self, lengths, load_episode, path=None):
+        self.lengths, self.load_episode, self.path = lengths, load_episode, path
+
+
+def test_a_user_defined_source_is_not_its_target(tmp_path, numpy_format, monkeypatch):
+    source, link = tmp_path / "held" / "a.npzs", tmp_path / "link.npzs"
+    source.parent.mkdir()
+    write(source, (5, 6))
+    write(tmp_path / "b.lance", (4,))
+    link.symlink_to(source)
+    opened = data.load_dataset(source)
+    own = Given([5], lambda index: episode(0, 5), str(link))
+    merged = partial(data.merge, [tmp_path / "b.lance", source])
+    for read in (partial(data.convert, source), partial(data.convert, opened), partial(data.convert, own), merged):
+        for target in (source, link, source.parent):
+            for mode in ("resume", "append", "overwrite", "error"):
+                with pytest.raises(ValueError, match=r"is, or holds, the dataset that is read \(.*\); give"):
+                    read(target, dest_format="npz", mode=mode, progress=False)
+    # A dataset of the engine, and a user's dataset behind a format of the engine.
+    for read, target, format in ((tmp_path / "b.lance", tmp_path / "b.lance", "npz"), (source, source, "folder")):
+        with pytest.raises(ValueError, match=r"is, or holds, the dataset that is read \(.*\); give"):
+            data.convert(read, target, dest_format=format, mode="overwrite", progress=False)
+    # A location that is relative to a former folder.
+    monkeypatch.chdir(tmp_path)
+    opened = data.load_dataset("held/a.npzs")
+    monkeypatch.chdir(source.parent)
+    with pytest.raises(ValueError, match=re.escape(f"the dataset that is read ({source})")):
+        data.convert(opened, source, dest_format="npz", mode="overwrite", progress=False)
+    assert data.load_dataset(source).lengths.tolist() == [5, 6]
+    data.convert(source, tmp_path / "a.npzs", progress=False)
+    assert data.load_dataset(tmp_path / "a.npzs").lengths.tolist() == [5, 6]
+
+
+@pytest.mark.parametrize("mode", ["resume", "append", "overwrite", "error"])
+def test_targets_of_user_defined_formats_may_be_no_paths(tmp_path, numpy_format, monkeypatch, mode):
+    class Failing(Given):
+        path = property(lambda self: Path("nothing").resolve(strict=True))
+
+        def __init__(self):
+            self.lengths, self.load_episode = [5], lambda index: {**episode(index, 5), "words": "go"}
+
+    class Held(Suppressing):
+        # Can be read once.
+        def open_reader(self):
+            if not self.lengths:
+                raise LookupError("nothing is held")
+            return Given(iter(self.lengths), None)
+
+    monkeypatch.setattr(numpy_format, "open_writer", lambda target, mode: target)
+    monkeypatch.setattr(numpy_format, "open_reader", Held.open_reader)
+    target = Held(None)
+    for count in (1, 2):
+        # Two conversions to one target: only the mode "append" compares the new episodes.
+        if count == 2 and mode != "append":
+            break
+        with pytest.warns(UserWarning, match="Held object.*: words are left out"):
+            data.convert(Failing(), target, dest_format="npz", mode=mode, progress=False)
+        assert target.lengths == [5] * count
+    target.write_episode = lambda ep_data: None
+    with pytest.raises(RuntimeError, match="Held object.*: its writer was given 1 episodes of 5 rows, and stored"):
+        data.convert(Given([5], lambda index: episode(index, 5)), target, dest_format="npz", mode="append", progress=False)
+
+
+def test_mode_error_is_not_left_to_the_writer_of_a_user(tmp_path, numpy_format, monkeypatch):
+    path, source, open_writer = tmp_path / "a.npzs", tmp_path / "b.lance", numpy_format.open_writer
+    write(path, (5, 6))
+    write(source, (4,))
+    monkeypatch.setattr(numpy_format, "open_writer", lambda path, mode: open_writer(path))
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episode(episode(0, 7))
+    (tmp_path / "gone.npzs").symlink_to(tmp_path / "nothing")
+    for target in (path, tmp_path / "gone.npzs"):
+        for write_to in (
+            partial(data.merge, [source], progress=False),
+            partial(data.convert, source, mode="error", progress=False),
+            partial(buffer.dump, mode="error"),
+            partial(data.open_writer, mode="error"),
+        ):
+            with pytest.raises(FileExistsError, match="there is a dataset already; add to it"):
+                write_to(target)
+    assert data.load_dataset(path).lengths.tolist() == [5, 6]
+    buffer.dump(tmp_path / "c.npzs", mode="error")
+    assert data.load_dataset(tmp_path / "c.npzs").lengths.tolist() == [7]
+
+
+def test_a_refused_collection_opens_no_writer_of_a_user(tmp_path, numpy_format):
+    path = tmp_path / "a.npzs"
+    write(path, (5, 6))
+    with swm.World("swm/TwoRoom-v1", 1) as world:
+        world.set_policy(swm.policy.RandomPolicy())
+        with pytest.raises(ValueError, match="codec: the writer decides"):
+            world.collect(path, episodes=1, mode="overwrite", codec="lossless")
+        with pytest.raises(ValueError, match="mode"):
+            world.collect(path, episodes=1, mode="replace")
+    assert data.load_dataset(path).lengths.tolist() == [5, 6]
+
+
+def several(name, value):
+    """Episodes of which the second has another column."""
+    return lambda index: {**episode(index, 5), **({name: value} if index else {})}
+
+
+@pytest.mark.parametrize(
+    ("reader", "error", "message"),
+    [
+        (lambda: Given([4], lambda i: episode(i, 5)), ValueError, r"episode 0: .* 5 rows of 'pixels', but lengths\[0\] is 4"),
+        (lambda: Given([5, 6], lambda i: episode(i, 5)), ValueError, r"episode 1: .* 5 rows of 'pixels', .* is 6"),
+        (lambda: Given([5, 5], several("mass", np.ones(5))), ValueError, r"episode 1: .*missing \[\], unexpected \['mass'\]"),
+        (lambda: Given([5, 5], several("state", "at rest")), ValueError, r"episode 1: .*missing \['state'\], unexpected \[\]"),
+        (lambda: Given([5], lambda i: {"words": "go"}), ValueError, "episode 0: it has no columns"),
+        (
+            lambda: Given(iter([5]), lambda i: episode(i, 5)),
+            TypeError,
+            "lengths: .* got an iterator, which can be read only once",
+        ),
+        (lambda: Given("5", lambda i: episode(i, 5)), TypeError, "lengths: expected a list .* got '5'"),
+        (lambda: Given(5, lambda i: episode(i, 5)), TypeError, "lengths: expected a list .* got 5"),
+        (lambda: Given({0: 5}, lambda i: episode(i, 5)), TypeError, "lengths: expected a list .* got {0: 5}"),
+        (lambda: Given([5, 5.5], lambda i: episode(i, 5)), ValueError, r"lengths\[1\]: expected a whole number .* got 5.5"),
+        (lambda: Given([np.nan], lambda i: episode(i, 5)), ValueError, r"lengths\[0\]: expected a whole number .* got nan"),
+        (lambda: Given(["5"], lambda i: episode(i, 5)), ValueError, r"lengths\[0\]: expected a whole number .* got '5'"),
+        (lambda: Given([-1], lambda i: episode(i, 5)), ValueError, r"lengths\[0\]: expected a whole number .* got -1"),
+    ],
+)
+def test_readers_that_contradict_themselves_are_refused(tmp_path, numpy_format, reader, error, message):
+    for name in ("a.h5", "a.lance", "a.npzs"):
+        with pytest.raises(error, match=message):
+            data.convert(reader(), tmp_path / name, progress=False)
+
+
+def test_whole_lengths_of_any_type_and_short_columns_of_actions_and_texts_are_read(tmp_path):
+    class Fresh:
+        lengths = property(lambda self: map(len, ("three", "words")))
+
+        def load_episode(self, index):
+            content = episode(index, 5)
+            return {**content, "action": content["action"][:-1].tolist(), "words": "go", data.EPISODE_DATA_KEY: {"mass": 2.5}}
+
+    for number, lengths in enumerate((None, np.array([5.0, 5.0]), (5, np.int32(5)))):
+        reader = Fresh() if lengths is None else Given(lengths, Fresh().load_episode)
+        with pytest.warns(UserWarning, match="episode_data, words are left out"):
+            assert data.convert(reader, tmp_path / f"{number}.h5", progress=False)["rows"] == 10
+    # A loader of columns that all episodes have.
+    reader = Given([5, 5], several("mass", np.ones(5)))
+    assert len(data.Loader(reader, 2, columns=["state"], backend="numpy", cache=0)) == 5
+    # A loader of episodes with one observation more than actions, of which the lengths are those of the actions.
+    longer = Given([4, 4], lambda index: {"state": np.arange(5.0), "action": np.ones((4, 1))})
+    for batch in data.Loader(longer, 8, backend="numpy", cache=0, shuffle=False):
+        assert batch["state"].ravel().tolist() == [0, 1, 2, 3] * 2
+
+
+class Suppressing:
+    """A writer of the user that suppresses errors, and returns nothing or something else when it is entered."""
+
+    def __init__(self, entered):
+        self.entered, self.lengths = entered, []
+
+    def __enter__(self):
+        return self.entered
+
+    def __exit__(self, *exc):
+        return True
+
+    def write_episode(self, ep_data):
+        self.lengths.append(len(ep_data["action"]))
+
+    def write_episodes(self, episodes):
+        for content in episodes:
+            self.write_episode(content)
+
+
+@pytest.mark.parametrize("entered", [None, "a file", Suppressing(None)])
+def test_writers_of_the_user_are_entered_and_left_alike(tmp_path, numpy_format, monkeypatch, entered):
+    def failing(index):
+        if index:
+            raise OSError("the source cannot be read")
+        return episode(0, 5)
+
+    writer = Suppressing(entered)
+    monkeypatch.setattr(numpy_format, "open_writer", lambda path, mode: writer)
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episode(episode(0, 6))
+    with pytest.raises(OSError, match="the source cannot be read"):
+        data.convert(Given([5, 5], failing), tmp_path / "a.npzs", verify=False, progress=False)
+    buffer.dump(tmp_path / "a.npzs")
+    with swm.World("swm/TwoRoom-v1", add_pixels=False, max_episode_steps=3) as world:
+        counts = world.collect(tmp_path / "a.npzs", policy=swm.policy.RandomPolicy(1), episodes=1, seed=1, progress=False)
+    assert counts == {"episodes": 1, "added": 1, "steps": 3}
+    if isinstance(entered, Suppressing):
+        assert writer.lengths == []
+        writer = entered
+    assert writer.lengths[-3:] == [5, 6, 4]
+
+
+def test_writers_of_the_user_need_the_method_that_is_called(tmp_path, numpy_format, monkeypatch):
+    several, one = SimpleNamespace(write_episodes=list), SimpleNamespace(write_episode=len)
+    opened = several
+    monkeypatch.setattr(numpy_format, "open_writer", lambda path, mode: nullcontext(opened))
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episode(episode(0, 6))
+    buffer.dump(tmp_path / "a.npzs")
+    convert = partial(data.convert, Given([5], lambda index: episode(index, 5)), tmp_path / "a.npzs", progress=False)
+    with pytest.raises(TypeError, match="writer: SimpleNamespace has no write_episode, which"):
+        convert()
+    opened = one
+    assert convert(verify=False)["episodes"] == 1
+    with pytest.raises(TypeError, match="writer: SimpleNamespace has no write_episodes, which"):
+        buffer.dump(tmp_path / "a.npzs")
 
 
 def test_format_names_are_unique_and_native_formats_are_registered(numpy_format):
@@ -508,7 +724,7 @@ def test_conversion_between_native_formats_keeps_the_content(tmp_path):
         data.convert(tmp_path / "a.lance", tmp_path / "e.lance", progress=False)
     data.convert(tmp_path / "a.lance", tmp_path / "e.lance", mode="append", progress=False)
     assert data.load_dataset(tmp_path / "e.lance").num_episodes == 5
-    with pytest.raises(ValueError, match="is the dataset that is read"):
+    with pytest.raises(ValueError, match="the dataset that is read"):
         data.convert(tmp_path / "a.lance", tmp_path / "a.lance", mode="overwrite", progress=False)
     with pytest.raises(TypeError, match="takes no colour"):
         data.convert(tmp_path / "a.lance", tmp_path / "f.lance", colour="red", progress=False)

@@ -68,6 +68,55 @@ def test_changed_columns_are_named(blocks):
             buffer.get(2)
 
 
+def test_environments_are_selected_by_a_mask():
+    buffer = HistoryBuffer(n_envs=4, max_len=5)
+    for t in range(3):
+        buffer.append({"x": np.arange(4) * 10 + t})
+    done = np.array([False, False, True, False])
+    assert buffer.get(1, done)["x"].tolist() == buffer.get(1, [2])["x"].tolist() == [[22]]
+    assert buffer.num_strided(~done) == 3 and buffer.get(1, [False] * 4) is None
+    buffer.reset(done)
+    assert [buffer.num_strided([env]) for env in range(4)] == [3, 3, 0, 3]
+    torch = pytest.importorskip("torch")
+    buffer.reset(torch.tensor([True, False, False, False]))
+    buffer.reset(torch.tensor([1]))
+    assert [buffer.num_strided([env]) for env in range(4)] == [0, 0, 0, 3]
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "text"),
+    [
+        (np.array([True, False, False]), ValueError, r"expected a mask of 2 booleans, got the shape \(3,\)"),
+        ([1.7], TypeError, r"expected indices or a mask of booleans, got \[1.7\]"),
+        ("0", TypeError, "expected indices or a mask of booleans, got '0'"),
+        ([5], ValueError, "5; expected indices from 0 to 1"),
+        ([-1], ValueError, "-1; expected indices from 0 to 1"),
+    ],
+)
+def test_environments_that_do_not_exist_are_refused(given, error, text):
+    buffer = filled(3)
+    for call in (lambda: buffer.get(1, given), lambda: buffer.reset(given), lambda: buffer.num_strided(given)):
+        with pytest.raises(error, match=f"HistoryBuffer: env_ids: {text}"):
+            call()
+    assert len(buffer) == 3
+
+
+@pytest.mark.parametrize("blocks", [(), ("action",)])
+def test_columns_that_later_steps_lack_are_named(blocks):
+    buffer = filled(1, action_block=2, block_keys=blocks)
+    for _ in range(3):
+        buffer.append({key: value for key, value in step(1).items() if key != "action"})
+    assert "action" not in buffer.get(1) or not blocks
+    if blocks:
+        with pytest.raises(ValueError, match=r"the steps differ in 'action' \(\(1, 2\), missing\)"):
+            buffer.get(2)
+    buffer = filled(2)
+    buffer.append({"reward": np.zeros(2)})
+    with pytest.raises(ValueError, match=r"the steps differ in 'pixels' \(\(1, 4, 4, 3\), missing\)"):
+        buffer.get(2)
+    assert list(buffer.get(1)) == ["reward"], "the steps before are not read"
+
+
 def test_wrong_sizes_are_named():
     with pytest.raises(ValueError, match="HistoryBuffer: action_block: 0; expected a whole number of at least 1"):
         HistoryBuffer(1, 3, action_block=0)

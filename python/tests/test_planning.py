@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -976,3 +977,97 @@ def test_plans_in_a_pool_end_with_their_episodes():
     # The first action of a plan is -0.9; the second environment goes on with its plan.
     expected = [[-0.9, -0.9], [-0.45, -0.45], [-0.9, 0.0], [-0.45, 0.45]]
     assert np.allclose(first, expected, atol=0.1)
+
+
+class Still:
+    """A cost whose cheapest plan rests."""
+
+    backend = "numpy"
+
+    def get_cost(self, infos, candidates):
+        return np.square(candidates).sum((2, 3))
+
+
+@pytest.mark.parametrize("length", [2**20, 2**36, 2**60])
+def test_plans_too_long_for_memory_are_refused(length):
+    space = gymnasium.spaces.Box(-1, 1, (1, 2))
+    for wrong in (
+        swm.PlanConfig(length, 1),
+        swm.PlanConfig(1, 1, action_block=length),
+        swm.PlanConfig(1, 1, history_len=length),
+    ):
+        with pytest.raises(ValueError, match=f"MPC .*: {length}; choose 1 to 10000"):
+            solvers.CEMSolver(Still()).configure(action_space=space, n_envs=1, config=wrong)
+        with pytest.raises(ValueError, match=f"MPC .*: {length}; choose 1 to 10000"):
+            rooms().set_policy(swm.policy.MPCPolicy(solvers.CEMSolver(Still()), wrong))
+    init = np.linspace(-0.9, 0.9, 20_000, dtype=np.float32).reshape(1, 10_000, 2)
+    solver = solvers.CEMSolver(Still(), num_samples=4, var_scale=1e-4, n_steps=1, topk=2)
+    solver.configure(action_space=space, n_envs=1, config=swm.PlanConfig(10_000, 1))
+    solved = solver.solve({"x": np.zeros((1, 1), np.float32)}, init_action=init)["actions"]
+    # With so little noise, the plan is the one that it starts from.
+    assert solved.shape == init.shape and np.allclose(solved, init, atol=1e-3) and not np.array_equal(solved, init)
+
+
+def test_configs_of_the_user_need_the_sizes_that_are_used():
+    space = gymnasium.spaces.Box(-1, 1, (1, 2))
+    for history in (None, 0):
+        solver = solvers.CEMSolver(Still(), num_samples=4, n_steps=1, topk=2)
+        config = SimpleNamespace(horizon=3, action_block=1, history_len=history)
+        solver.configure(action_space=space, n_envs=1, config=config)
+        assert solver.solve({"x": np.zeros((1, 1), np.float32)})["actions"].shape == (1, 3, 2)
+    with pytest.raises(ValueError, match=r"config\.horizon: None; expected a whole number"):
+        solver.configure(action_space=space, n_envs=1, config=SimpleNamespace(horizon=None, action_block=1))
+
+
+class ScalarBox(gymnasium.Env):
+    """An environment whose actions are scalars."""
+
+    def __init__(self, render_mode=None):
+        self.action_space = gymnasium.spaces.Box(-1, 1, (), np.float32)
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        assert np.size(action) == 1
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+if "ScalarBox-v0" not in gymnasium.registry:
+    gymnasium.register("ScalarBox-v0", entry_point=ScalarBox, max_episode_steps=5)
+
+
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("envs", [1, 2, 3])
+def test_scalar_actions_have_one_dimension_for_any_number_of_environments(envs, own):
+    solver = solvers.CEMSolver(Still(), num_samples=4, n_steps=2, topk=2)
+    world = swm.World("ScalarBox-v0", envs, add_pixels=False)
+    world.set_policy(swm.policy.MPCPolicy(Wrapped(solver) if own else solver, swm.PlanConfig(horizon=3, receding_horizon=2)))
+    world.reset(seed=0)
+    world.step(3)
+    assert solver.action_dim == 1 and world.infos["action"].size == envs
+    pool = EnvPool([ScalarBox] * envs)
+    policy = swm.policy.MPCPolicy(solver, swm.PlanConfig(horizon=3, receding_horizon=2))
+    policy.set_env(pool)
+    pool.reset(seed=0)
+    assert solver.action_dim == 1 and policy.get_action({"x": np.zeros((envs, 1, 1), np.float32)}).shape == (envs,)
+    # A space with one axis is that of one environment.
+    solver.configure(action_space=gymnasium.spaces.Box(-1, 1, (2,)), n_envs=2, config=swm.PlanConfig(1, 1))
+    assert solver.action_dim == 2
+
+
+def test_complex_plans_are_refused():
+    class Phases:
+        def configure(self, **given):
+            pass
+
+        def solve(self, infos, init_action=None):
+            return {"actions": np.full((2, 1, 2), 0.5 + 1j)}
+
+    world = rooms()
+    world.set_policy(swm.policy.MPCPolicy(Phases(), swm.PlanConfig(1, 1)))
+    world.reset(seed=0)
+    with pytest.raises(ValueError, match="expected real actions, got complex numbers"):
+        world.step()

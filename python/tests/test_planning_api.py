@@ -178,6 +178,79 @@ def test_a_callback_ends_the_search_with_the_plan_so_far(solver, settings, space
     assert evaluated == (4 if solver is planning.GradientSolver else 3)
 
 
+@pytest.mark.parametrize("init", [None, np.full((3, 3, 2), 0.4, np.float32)], ids=["zeros", "init"])
+@pytest.mark.parametrize(
+    ("solver", "settings"),
+    [
+        (planning.CEMSolver, {"topk": 10}),
+        (planning.CEMSolver, {"topk": 2}),
+        (planning.ICEMSolver, {"topk": 10, "alpha": 0.3}),
+        (planning.MPPISolver, {"topk": 10, "temperature": 0.05}),
+        (planning.MPPISolver, {"topk": 50, "var_scale": 0.3}),
+        (planning.MPPISolver, {"topk": 1}),
+        (planning.PredictiveSamplingSolver, {"noise_scale": 0.3}),
+    ],
+)
+def test_callbacks_get_the_moments_of_the_solver(solver, settings, init):
+    keep, spread, shift = Keep(), hooks.VarNormRecorder("none"), hooks.MeanShiftRecorder()
+    steps = {} if solver is planning.PredictiveSamplingSolver else {"n_steps": 5}
+    search = configured(solver(ToTarget(), num_samples=50, seed=3, callbacks=[keep, spread, shift], **steps, **settings))
+    found = search.solve(infos(), init_action=init)
+    means = [state["prev_mean"] for state in keep.states] + [found["actions"]]
+    assert len(means) == 1 + steps.get("n_steps", 1)
+    for state, mean, next_mean in zip(keep.states, means, means[1:], strict=False):
+        # The first candidate is the mean that the engine draws around.
+        assert torch.equal(mean, state["candidates"][:, 0]) and torch.allclose(state["mean"], next_mean, rtol=0, atol=1e-6)
+    for state, following in zip(keep.states, keep.states[1:], strict=False):
+        assert torch.equal(state["var"], following["prev_var"])
+    moved = [float((after - before).flatten(1).norm(dim=1).mean()) for before, after in zip(means, means[1:], strict=False)]
+    assert np.allclose(found["callbacks"]["MeanShiftRecorder"][0], moved, rtol=0, atol=1e-5)
+    trace = [search["spread"] for search in found["trace"]]
+    assert np.allclose(np.transpose(found["callbacks"]["VarNormRecorder"][0]), trace, rtol=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.6])
+@pytest.mark.parametrize("init", [None, [[1, 0, 2], [2, -1, 2], [0, 2, 1]]], ids=["uniform", "init"])
+def test_callbacks_get_the_probabilities_of_the_solver(alpha, init):
+    class Mixed:
+        def get_cost(self, info_dict, action_candidates):
+            return (action_candidates * torch.arange(18.0).sin().reshape(3, 6)).sum((2, 3))
+
+    keep = Keep()
+    space = gymnasium.spaces.MultiDiscrete([[3]] * 3)
+    few = {"num_samples": 60, "n_steps": 4, "topk": 25, "smoothing": 0.05, "seed": 3}
+    solver = planning.CategoricalCEMSolver(Mixed(), alpha=alpha, callbacks=[keep], **few)
+    solver.configure(action_space=space, n_envs=3, config=swm.PlanConfig(3, 3, action_block=2))
+    init = None if init is None else np.repeat(np.asarray(init)[..., None], 2, -1)
+    found = solver.solve(infos(), init_action=init)
+    # The first candidate has the most probable options, from which the plan is made.
+    flat = [state["prev_probs"] for state in keep.states] + [keep.states[-1]["probs"]]
+    for state, probs, following in zip(keep.states, flat, flat[1:], strict=False):
+        mode = state["candidates"][:, 0].reshape(probs.shape)
+        assert torch.equal(probs.argmax(-1), mode.argmax(-1)) and torch.equal(state["probs"], following)
+    assert torch.equal(flat[-1].argmax(-1), found["actions"])
+    # The engine's trace has the probability that two draws of a choice differ.
+    differ = [1 - state["probs"].square().sum(-1).mean((1, 2)) for state in keep.states]
+    assert np.allclose(torch.stack(differ, 1), [search["spread"] for search in found["trace"]], atol=1e-5)
+    assert torch.equal(found["probs"][0], flat[-1])
+
+
+def test_a_single_elite_has_no_spread():
+    for solver, settings in ((planning.MPPISolver, {"topk": 1, "n_steps": 2}), (planning.PredictiveSamplingSolver, {})):
+        found = configured(solver(ToTarget(), callbacks=[hooks.EliteSpreadRecorder()], **settings)).solve(infos())
+        assert found["callbacks"]["EliteSpreadRecorder"] == [[0.0] * settings.get("n_steps", 1)]
+
+
+def test_callbacks_with_the_same_key_all_have_a_history():
+    recorders = [hooks.BestCostRecorder(kind) for kind in ("none", "mean", "sum")]
+    recorders.append(hooks.MeanCostRecorder())
+    recorders[2].name = "BestCostRecorder_2"
+    solver = configured(planning.CEMSolver(ToTarget(), n_steps=2, callbacks=recorders))
+    found = solver.solve(infos())["callbacks"]
+    keys = ["BestCostRecorder", "BestCostRecorder_3", "BestCostRecorder_2", "MeanCostRecorder"]
+    assert found == {key: recorder.history for key, recorder in zip(keys, recorders, strict=True)}
+
+
 def test_gradient_recorders():
     recorders = [hooks.GradNormRecorder("none"), hooks.GradNormRecorder(per_step=True), hooks.ActionNormRecorder("sum")]
     recorders[1].name = "steps"
@@ -408,6 +481,9 @@ def test_solvers_name_what_they_cannot_plan_with():
     for seed in (-1, 1.5, "a"):
         with pytest.raises(ValueError, match="seed: .*; expected a whole number of at least 0"):
             swm.solver.CEMSolver("simulator", seed=seed)
+    for size in (0, 1.5, "a"):
+        with pytest.raises(ValueError, match="batch_size: .*; expected a whole number of at least 1"):
+            swm.solver.CEMSolver("simulator", batch_size=size)
     solver = swm.solver.CEMSolver(Plain(), num_samples=8, n_steps=1, topk=2)
     solver.configure(action_space=BOX, n_envs=3, config=swm.PlanConfig(horizon=2, receding_horizon=1))
     for infos, error in (({}, ValueError), ({"words": ["a"]}, ValueError), ([], TypeError)):

@@ -116,3 +116,15 @@ def test_condition_of_a_group_holds_after_an_update_and_is_checked():
 def test_impossible_condition_raises():
     with pytest.raises(RuntimeError, match="1000 tries"):
         swm_spaces.Box(0, 1, shape=(2,), constrain_fn=lambda x: False).sample()
+
+
+def test_values_that_the_type_does_not_hold_are_refused():
+    number = swm_spaces.Box(-np.inf, np.inf, (1,))
+    for wrong in ([1e300], np.array([-1e300])):
+        with pytest.raises(swm_spaces.OutsideError, match="is not in"):
+            number.set_value(wrong)
+    number.set_value([np.inf])
+    assert number.value.tolist() == [np.inf]
+    for wrong in ([256, 0, 0], [-1, 0, 0], [2**70, 0, 0]):
+        with pytest.raises(swm_spaces.OutsideError, match="is not in"):
+            swm_spaces.RGBBox().set_value(wrong)

@@ -148,6 +148,12 @@ def test_models_are_saved_on_this_machine(home, rooms, tmp_path, monkeypatch):
     for given in ({"run_name": "s3://bucket/x"}, {"run_name": "x", "cache_dir": "gs://bucket"}):
         with pytest.raises(ValueError, match="is a URI; expected a path of this machine"):
             save_pretrained(torch.nn.Linear(2, 3), config=linear, **given)
+    for name in ("", ".", "..", "a/.."):
+        with pytest.raises(ValueError, match="run_name: expected a name or a local folder"):
+            save_pretrained(torch.nn.Linear(2, 3), name, linear)
+    with pytest.raises(FileNotFoundError, match="there is no checkpoint ''"):
+        load_pretrained("")
+    assert not list(home.rglob("weights.pt"))
     for given, folder in (({"run_name": "~/x"}, "x"), ({"run_name": "y", "cache_dir": "~/c"}, "c/checkpoints/y")):
         save_pretrained(torch.nn.Linear(2, 3), config=linear, **given)
         assert (tmp_path / "user" / folder / "weights.pt").is_file()

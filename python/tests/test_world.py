@@ -303,6 +303,16 @@ def test_discrete_actions_are_whole_numbers():
     world.envs.step(np.array([1.0, 0.0]))
     with pytest.raises(ValueError, match="actions: expected whole numbers"):
         world.envs.step(np.array([1.0, 0.7]))
+    world.envs.step(np.array([1, 0.0], object))
+    for wrong, words in (([1, 0.7], "whole numbers"), ([1, None], "finite actions")):
+        with pytest.raises(ValueError, match=f"actions: expected {words}"):
+            world.envs.step(np.array(wrong, object))
+    for wrong in (1j, np.complex64(1j), "1"):
+        with pytest.raises(ValueError, match="actions: expected real actions, got complex numbers or texts"):
+            world.envs.step(np.array([1, wrong], object))
+    # Floats have no such number.
+    with pytest.raises(ValueError, match=f"discrete action .{2**53 + 1}"):
+        world.envs.step(np.array([2**53 + 1, 0], object))
 
 
 def test_metrics_name_the_episodes_that_count():
@@ -516,6 +526,59 @@ def test_options_of_a_reset_are_dicts():
     for options in (5, ["all", None]):
         with pytest.raises(TypeError, match="options: expected a dict"):
             world.reset(options=options)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"seed": 9, "options": {"variation": ["agent"], "variation_values": {"agent.size": 1e9}}},
+        {"seed": [9, 9], "options": [{"state": [np.nan]}] * 2},
+        {"seed": [9], "options": {"variation": ["agent"]}},
+    ],
+)
+def test_a_refused_reset_leaves_the_world_as_it_was(wrong):
+    def played(fails):
+        world = swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False, max_episode_steps=4)
+        world.set_policy(swm.policy.RandomPolicy(1))
+        world.reset(seed=1)
+        world.step(3)
+        if fails:
+            with pytest.raises(ValueError):
+                world.reset(**wrong)
+        assert world.seed == 1 and not any(name.startswith("variation.") for name in world.infos)
+        seen = []
+        for _ in range(4):
+            world.step()
+            seen.append({name: world.infos[name].tolist() for name in ("state", "action", "step_idx")})
+        return repr((world.envs.seeds.tolist(), seen))
+
+    assert played(True) == played(False)
+
+
+def test_a_reset_during_a_call_of_another_thread_changes_nothing():
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, add_pixels=False)
+    seen = []
+
+    class Resetting(Zero):
+        def get_action(self, infos):
+            with ThreadPoolExecutor(1) as threads, pytest.raises(ValueError, match="another call is using it"):
+                threads.submit(world.reset, seed=9, options={"variation": ["all"]}).result()
+            seen.append((world.seed, world._varied, world._first_seeds))
+            return super().get_action(infos)
+
+    world.set_policy(Resetting())
+    world.reset(seed=1)
+    world.evaluate(episodes=1, seed=0, eval_budget=2, floor=False, progress=False)
+    assert seen and all(kept == (1, [], []) for kept in seen)
+
+
+def test_a_closed_world_says_so():
+    world = rooms(num_envs=2)
+    world.reset(seed=0)
+    world.close()
+    for use in (lambda: world.rewards, lambda: world.envs.step(np.zeros((2, 2))), lambda: world.reset(seed=0)):
+        with pytest.raises(RuntimeError, match="the world is closed"):
+            use()
 
 
 @pytest.mark.parametrize("index", [-1, 2, 2**70])

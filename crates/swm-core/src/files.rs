@@ -19,6 +19,14 @@ use std::fs::{File, FileType};
 use std::io::{ErrorKind, Read as _, Seek as _, Write as _};
 use std::path::{Component, Path, PathBuf};
 
+/// Serializes a path as text, for `serialize_with`. JSON holds text only, so what is not UTF-8 becomes `\u{fffd}`, as on the terminal.
+///
+/// # Errors
+/// When the serializer fails.
+pub fn serialize_path<S: serde::Serializer>(path: &Path, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    serializer.serialize_str(&path.to_string_lossy())
+}
+
 /// Opens a regular file for reading.
 ///
 /// # Errors

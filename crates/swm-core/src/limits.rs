@@ -55,7 +55,7 @@ pub const WRAPPERS: Limit = Limit::new("number of wrappers", 64);
 pub const MODEL_STEPS: Limit = Limit::new("number of model steps", 10_000);
 /// Candidates of a solver.
 pub const SAMPLES: Limit = Limit::new("number of samples", 1_000_000);
-/// Values of all candidates of one iteration of a solver: 4 GiB.
+/// Values of all candidates of one iteration of a solver, and of the plans and the history of all environments: 4 GiB.
 pub const CANDIDATE_VALUES: Limit = Limit::new("values of all candidates", 1 << 30);
 /// Bytes of the observations and frames of all environments, and of a batch of clips.
 pub const BATCH_BYTES: Limit = Limit::new("bytes of a batch", 16 << 30);

@@ -181,7 +181,7 @@ impl PlanSpace<'_> {
     pub fn dim(&self) -> usize {
         match self {
             Self::Continuous { low, .. } => low.len(),
-            Self::Discrete { choices } => choices.iter().sum(),
+            Self::Discrete { choices } => choices.iter().copied().fold(0, usize::saturating_add),
         }
     }
 }

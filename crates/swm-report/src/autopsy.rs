@@ -106,8 +106,11 @@ fn figure(html: &mut String, heading: &str, caption: &str, chart: &str) {
     );
 }
 
-fn shares(Estimate { value, low, high }: &Estimate) -> String {
-    format!("<b>{}</b> [{}, {}]", points(*value), points(*low), points(*high))
+/// A rate with its interval, in percentage points.
+fn shares(rate: Option<&Estimate>) -> String {
+    rate.map_or("–".to_owned(), |Estimate { value, low, high }| {
+        format!("<b>{}</b> [{}, {}]", points(*value), points(*low), points(*high))
+    })
 }
 
 /// Opens a table with these columns, the first of which names rows.
@@ -138,9 +141,9 @@ fn contributions(html: &mut String, found: &Autopsy) -> Result<()> {
              <td class=\"n\" data-label=\"Alone\">{}</td><td class=\"n\" data-label=\"Ranks first\">{}</td></tr>",
             contribution.ingredient.letter(),
             contribution.ingredient.summary(),
-            shares(&contribution.recovered),
-            shares(&contribution.alone),
-            percent(contribution.first)
+            shares(found.on_failures(&contribution.recovered)),
+            shares(found.on_failures(&contribution.alone)),
+            found.on_failures(contribution.first).map_or("–".to_owned(), percent)
         );
     }
     html.push_str("</tbody>\n</table>\n</div>\n</section>\n");
@@ -156,20 +159,18 @@ fn arms(html: &mut String, found: &Autopsy) -> Result<()> {
     open_table(html, &["Arm", "Success, %", "Recovered of failures", "Harmed of solved starts"]);
     for arm in &found.arms {
         let Estimate { value, low, high } = arm.success;
-        let of_unchanged = |estimate: &Estimate| {
-            if arm.ingredients.is_empty() { "–".to_owned() } else { shares(estimate) }
-        };
+        let is_changed = !arm.ingredients.is_empty();
         let _ = writeln!(
             html,
             "<tr><th scope=\"row\">{}</th><td class=\"n\" data-label=\"Success, %\"><b>{:.0}</b> [{:.0}, {:.0}]</td>\
              <td class=\"n\" data-label=\"Recovered of failures\">{}</td>\
              <td class=\"n\" data-label=\"Harmed of solved starts\">{}</td></tr>",
-            if arm.ingredients.is_empty() { "unchanged".to_owned() } else { letters(&arm.ingredients) },
+            if is_changed { letters(&arm.ingredients) } else { "unchanged".to_owned() },
             100.0 * value,
             100.0 * low,
             100.0 * high,
-            of_unchanged(&arm.recovered),
-            of_unchanged(&arm.harmed)
+            shares(found.on_failures(&arm.recovered).filter(|_| is_changed)),
+            shares(found.on_solved(&arm.harmed).filter(|_| is_changed))
         );
     }
     html.push_str("</tbody>\n</table>\n</div>\n</section>\n");
@@ -297,6 +298,18 @@ mod tests {
             ],
         };
         let strip = |start| FrameStrip { start, set: "D".to_owned(), png: vec![1, 2, 3] };
+        let harmed = |starts| {
+            let mut html = String::new();
+            arms(&mut html, &Autopsy { starts, ..found.clone() }).expect("the arms");
+            html.matches("data-label=\"Harmed of solved starts\">–<").count()
+        };
+        assert_eq!([harmed(30), harmed(3)], [1, 3], "starts without solved ones harm none");
+        let first = |repairs| {
+            let mut html = String::new();
+            contributions(&mut html, &Autopsy { repairs, ..found.clone() }).expect("the contributions");
+            html.matches("data-label=\"Ranks first\">–<").count()
+        };
+        assert_eq!([first(found.repairs.clone()), first(vec![])], [0, 2], "nothing ranks first without failures");
         let page = AutopsyPage {
             title: "Autopsy of <b>x</b>".to_owned(),
             env: "swm/TwoRoom-v1".to_owned(),

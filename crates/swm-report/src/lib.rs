@@ -33,4 +33,5 @@ pub use leaderboard::{BoardEntry, BoardPages, BoardRow, BoardTable, Leaderboard,
 pub use page::{ReportOptions, render, write_report, write_report_with};
 pub use read::{parse_results, read_results};
 pub use study::{StudyPage, TablePage, write_study, write_table};
+pub use text::number;
 pub use training_log::{Metrics, Series, Training, read_metrics};

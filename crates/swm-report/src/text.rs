@@ -71,7 +71,7 @@ pub(crate) fn p_value(p: f64) -> String {
 }
 
 /// Formats a number with about four significant digits and no trailing zeros.
-pub(crate) fn number(value: f64) -> String {
+pub fn number(value: f64) -> String {
     let size = value.abs();
     if !value.is_finite() {
         return "–".to_owned();

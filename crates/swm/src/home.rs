@@ -17,7 +17,7 @@ const DEFAULT_FORMAT: &str = "lance";
 /// Returns the folder of all named datasets, checkpoints and weights.
 ///
 /// # Errors
-/// When neither `STABLEWM_HOME` nor `HOME` is set, as of all functions below that read a name.
+/// When neither `STABLEWM_HOME` nor `HOME` is set, or the first is a URI, as of all functions below that read a name.
 pub fn home() -> Result<PathBuf> {
     swm_core::home::folder()
 }
@@ -302,15 +302,14 @@ pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
 }
 
 /// Returns `given` unchanged if it is a path, and the entry of `folder` with this suffix if it is a name. A text is a
-/// path if it contains a folder or an extension, or if a file of this name exists. A path of `~/` is one in the user's home, which a
-/// shell replaces only at the start of a word.
+/// path if it contains a folder or an extension, or if a file of this name exists. A path of `~/` is one in the user's home.
 ///
 /// # Errors
 /// When it is a name and there is no folder.
 fn named(given: &str, folder: fn() -> Result<PathBuf>, suffix: &str) -> Result<PathBuf> {
     let path = Path::new(given);
-    if let (Ok(below), Some(user)) = (path.strip_prefix("~"), swm_core::home::of_user()) {
-        return Ok(user.join(below));
+    if let Some(path) = swm_core::home::of_tilde(path) {
+        return Ok(path);
     }
     // A name has no slash, not even at its end.
     if given.contains(std::path::is_separator) || path.extension().is_some() || path.exists() {

@@ -16,7 +16,7 @@ from stable_worldmodel._forks import fork_lock
 from . import _tensors
 from ._tensors import NUMBERING, Array
 from .dataset import Dataset, Rows, Transform
-from .format import open_writer
+from .format import open_writer, writing
 
 __all__ = ["ReplayBuffer", "classic_filter"]
 
@@ -367,7 +367,7 @@ class ReplayBuffer(Dataset):
                 to it, `"error"` raises. An empty buffer replaces nothing.
             **kwargs: Further arguments of `open_writer`.
         """
-        with open_writer(path, format=format, mode=mode, **kwargs) as writer:
+        with writing(open_writer(path, format=format, mode=mode, **kwargs), "write_episodes") as writer:
             writer.write_episodes(self.episodes())
 
     def __repr__(self) -> str:

@@ -817,6 +817,9 @@ class ConcatDataset:
         """See :meth:`Dataset.get_row_data`."""
         now = self._now
         parts, rows = self._locate(now._rows_before, np.atleast_1d(np.asarray(row_idx)), "rows")
+        if not len(rows):
+            # Columns without rows, as the first dataset has them.
+            return dict(now._alike([now.datasets[0].get_row_data([])])[0])
         found = [now.datasets[part].get_row_data(row) for part, row in zip(parts.tolist(), rows.tolist(), strict=True)]
         found = now._alike(found, axes=0)
         if np.ndim(row_idx) == 0:

@@ -18,9 +18,10 @@ Afterwards `load_dataset`, `convert`, `Loader` and `World.collect(path, format="
 
 from __future__ import annotations
 
+import contextlib
 import os
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from ._tensors import EPISODE
@@ -60,6 +61,8 @@ def split_episode_data(ep_data: Mapping[str, Any]) -> tuple[dict[str, Any], dict
 @runtime_checkable
 class Writer(Protocol):
     """Stores finished episodes. A context manager: the dataset is complete when the context ends.
+
+    Episodes go to what `__enter__` returns, or to the writer itself if that lacks the method.
 
     An episode is a dict with a list of steps or an array `(T, ...)` for each column; images are `(H, W, 3)` of
     `uint8`. Row `t` holds the observation at `t` and the action taken from it. The action of the last row is missing: NaN,
@@ -165,25 +168,45 @@ def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode
     kind = get_format(format) if format is not None else detect_format(path)
     if kind is None:
         kind = FORMATS["lance"]
-    return kind.open_writer(path, mode=mode, **kwargs)
+    return kind.open_writer(path, mode=mode, **kwargs) if kind.native else open_foreign(kind, path, mode, **kwargs)
 
 
-def foreign_writer(path: str | os.PathLike[str], format: str | None, mode: str) -> Any | None:
-    """A writer of a user-defined format; `None` for formats of the engine. The mode `"resume"` appends.
+def open_foreign(kind: type[Format], path: Any, mode: str, **kwargs: Any) -> Any:
+    """Opens a writer of a user-defined format.
 
     Raises:
         FileExistsError: If the mode is `"error"`, and there is a file, or a folder that is not empty.
     """
-    kind = _foreign(path, format)
-    text = os.fspath(path)
-    if kind is not None and mode == "error" and "://" not in text and os.path.lexists(text):
-        # Not left to the user's writer, because the default must not replace anything.
-        if not os.path.isdir(text) or os.listdir(text):
-            raise FileExistsError(
-                f"{text}: there is a dataset already; continue it (mode='append' or 'resume') or replace it (mode='overwrite')"
-            )
-    mode = "append" if mode == "resume" else mode
-    return None if kind is None else kind.open_writer(path, mode=validate_write_mode(mode))
+    # Not left to the user's writer, because the default must not replace anything.
+    if validate_write_mode(mode) == "error":
+        check_free(path)
+    return kind.open_writer(path, mode=mode, **kwargs)
+
+
+@contextlib.contextmanager
+def writing(writer: Any, method: str) -> Iterator[Any]:
+    """Enters a writer, which may be a user's.
+
+    Yields:
+        What its `__enter__` returns, or the writer itself if that lacks `method`, which is to be called.
+
+    Raises:
+        TypeError: If both lack it.
+        BaseException: The error of the block, also if the writer suppresses it: there is no result to report.
+    """
+    failed: BaseException | None = None
+    with writer as entered:
+        try:
+            able = next((one for one in (entered, writer) if hasattr(one, method)), None)
+            if able is None:
+                kind = type(writer if entered is None else entered).__name__
+                raise TypeError(f"writer: {kind} has no {method}, which is called with episodes; give it that method")
+            yield able
+        except BaseException as error:
+            failed = error
+            raise
+    if failed is not None:
+        raise failed
 
 
 def foreign_episodes(path: str | os.PathLike[str], format: str | None, mode: str) -> int:
@@ -192,12 +215,12 @@ def foreign_episodes(path: str | os.PathLike[str], format: str | None, mode: str
     Raises:
         ValueError: If the dataset cannot be read, and the collection resumes.
     """
-    kind = _foreign(path, format)
+    kind = user_defined(path, format)
     if kind is None or mode not in ("resume", "append"):
         return 0
     text = os.fspath(path)
     try:
-        return len(kind.open_reader(path).lengths)
+        return len(episode_lengths(kind.open_reader(path)))
     except Exception as error:
         # A dataset that is there may lack a file of its own.
         if isinstance(error, FileNotFoundError) if "://" in text else is_free(text):
@@ -209,12 +232,60 @@ def foreign_episodes(path: str | os.PathLike[str], format: str | None, mode: str
         return 0
 
 
-def is_free(path: str) -> bool:
-    """Whether a local path has nothing, or an empty folder."""
-    return not os.path.exists(path) or (os.path.isdir(path) and not os.listdir(path))
+def check_free(path: Any, problem: str = "") -> None:
+    """Checks that a target is free.
+
+    Args:
+        path: The target.
+        problem: What to add to the error.
+
+    Raises:
+        FileExistsError: If there is a file, or a folder that is not empty.
+    """
+    if not is_free(path):
+        there = f"{path}: there is a dataset already{problem}"
+        raise FileExistsError(f"{there}; add to it (mode='append') or replace it (mode='overwrite')")
 
 
-def _foreign(path: str | os.PathLike[str], format: str | None) -> type[Format] | None:
+def is_free(path: Any) -> bool:
+    """Whether a path has nothing, or an empty folder. What only its format can look up (a URI, or no path) counts as free."""
+    if not isinstance(path, (str, os.PathLike)):
+        return True
+    path = os.fspath(path)
+    return "://" in path or not os.path.lexists(path) or (os.path.isdir(path) and not os.listdir(path))
+
+
+def episode_lengths(reader: Any, is_kept: bool = False) -> list[int]:
+    """The number of rows of every episode of a user's reader.
+
+    Args:
+        reader: The reader.
+        is_kept: Whether others may read its lengths again.
+
+    Raises:
+        TypeError: If `lengths` is not a sequence, or an iterator that a second call would find empty, and the reader is kept.
+        ValueError: If one of them is not a whole number of at least 0.
+    """
+    given = reader.lengths
+    can_be_read_once = is_kept and isinstance(given, Iterator) and reader.lengths is given
+    is_sequence = hasattr(given, "__iter__") or hasattr(given, "__getitem__")
+    if can_be_read_once or not is_sequence or isinstance(given, (str, bytes, Mapping)):
+        kind = "an iterator, which can be read only once" if can_be_read_once else f"{given!r:.80}"
+        raise TypeError(f"lengths: expected a list of the number of rows of every episode, got {kind}; correct the reader")
+    return [_length(episode, length) for episode, length in enumerate(given)]
+
+
+def _length(episode: int, given: Any) -> int:
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        rows = int(given)
+        if rows == given and rows >= 0:
+            return rows
+    raise ValueError(
+        f"lengths[{episode}]: expected a whole number of rows of at least 0, got {given!r:.80}; correct the reader"
+    )
+
+
+def user_defined(path: str | os.PathLike[str], format: str | None) -> type[Format] | None:
     """The user-defined format of a path; `None` for formats of the engine."""
     kind = get_format(format) if format is not None else detect_format(path)
     return None if kind is None or kind.native else kind

@@ -16,8 +16,8 @@ from stable_worldmodel import _engine, _files
 
 from . import _tensors
 from .dataset import Transform
-from .foreign import check_overrides, engine_of, left_out
-from .format import FORMATS, Format, detect_format, get_format, is_free, validate_write_mode
+from .foreign import check_distinct, check_overrides, engine_of, left_out, note_location
+from .format import FORMATS, Format, check_free, detect_format, episode_lengths, get_format, is_free, open_foreign, writing
 from .normalization import column_normalizer
 from .writer import codec_json
 
@@ -123,7 +123,10 @@ def load_dataset(
         # Readers of user-defined formats need not accept every argument.
         defaults = {"num_steps": 1, "frameskip": 1}
         given = {name: value for name, value in given.items() if value != defaults.get(name)}
-    return kind.open_reader(path, **given, **kwargs)
+    reader = kind.open_reader(path, **given, **kwargs)
+    if not kind.native:
+        note_location(reader, path)
+    return reader
 
 
 def _progress_callback(progress: bool) -> Callable[[str, int, int], None] | None:
@@ -244,6 +247,8 @@ def convert(
 
     Raises:
         TypeError: If a subclass of an open dataset that the engine reads overrides how it is read, such as `load_episode`.
+        ValueError: If the target is a source, or a folder that holds one, in every mode. Of an open dataset of a class of
+            your own, the location is its attribute `path`.
         RuntimeError: If the target has other contents than the source.
     """
     if isinstance(source, (str, os.PathLike)):
@@ -252,24 +257,27 @@ def convert(
     format = dest_format if format is None else format
     kind = get_format(format) if format is not None else detect_format(dest)
     kind = FORMATS["lance"] if kind is None else kind
+    # A writer of the user may take another target than a path.
+    if kind.native or isinstance(dest, (str, os.PathLike)):
+        check_distinct(source, _engine.target(os.fspath(dest), kind.name) if kind.native else os.fspath(dest))
     report = _progress_callback(progress)
     if not kind.native:
         given = {"codec": codec, "jpeg_quality": jpeg_quality, "least_psnr": least_psnr}
         if refused := [name for name, value in given.items() if value is not None]:
             problem = f"the format {kind.name!r} is user-defined, and its writer decides how images are stored"
             raise ValueError(f"convert: {', '.join(refused)}: {problem}; leave it out, or give an argument of that writer")
-        if mode == "resume" and not is_free(os.fspath(dest)):
-            problem = f"conversions to the user-defined format {kind.name!r} do not resume"
-            raise FileExistsError(
-                f"{os.fspath(dest)}: there is a dataset already, and {problem}; use mode='overwrite' or 'append'"
-            )
+        if mode == "resume":
+            check_free(dest, f", and conversions to the user-defined format {kind.name!r} do not resume")
+            mode = "error"
         before = (_lengths(kind, dest) or []) if verify and mode == "append" else []
         with left_out() as names:
-            written = write_all(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report, names)
+            # Before the writer opens, which may replace what is there.
+            engine = engine_of(source)
+            written = write_all(engine, open_foreign(kind, dest, mode, **kwargs), report, names)
         _warn_left_out(dest, names)
         if verify:
             found = _lengths(kind, dest)
-            _check_lengths(source, dest, kind, None if found is None else found[len(before) :])
+            _check_lengths(engine, dest, kind, None if found is None else found[len(before) :])
         return written
     if kind.name in ("video", "lance-video"):
         # Frames have no time; videos of datasets have a fixed rate.
@@ -286,34 +294,34 @@ def convert(
 def _lengths(kind: type[Format], path: str | os.PathLike[str]) -> list[int] | None:
     """The lengths of the episodes of a user-defined format; `None` if the format has no reader."""
     try:
-        return [int(length) for length in kind.open_reader(path).lengths]
+        return episode_lengths(kind.open_reader(path))
     except NotImplementedError:
         return None
     except Exception:
         # A target may be no path: the reader is asked first.
-        if is_free(os.fspath(path)):
+        if is_free(path):
             return []
         raise
 
 
-def _check_lengths(source: Any, dest: str | os.PathLike[str], kind: type[Format], found: list[int] | None) -> None:
+def _check_lengths(engine: Any, dest: str | os.PathLike[str], kind: type[Format], found: list[int] | None) -> None:
     """Checks the lengths of the episodes that a writer stored against those of the source.
 
     Raises:
         RuntimeError: If they differ.
     """
-    expected = [int(length) for length in engine_of(source).lengths()]
+    expected = engine.lengths().tolist()
     if found is not None and found != expected:
         given, stored = (f"{len(lengths)} episodes of {sum(lengths)} rows" for lengths in (expected, found))
         problem = f"its writer was given {given}, and stored {stored}"
-        raise RuntimeError(f"{os.fspath(dest)}: {problem}; correct the writer of the format {kind.name!r}, or use verify=False")
+        raise RuntimeError(f"{dest}: {problem}; correct the writer of the format {kind.name!r}, or use verify=False")
 
 
 def _warn_left_out(dest: str | os.PathLike[str], names: set[str]) -> None:
     """Warns of the texts and values of episodes that a conversion has not written."""
     if names:
         warnings.warn(
-            f"{os.fspath(dest)}: {', '.join(sorted(names))} are left out, because a conversion from or to a user-defined "
+            f"{dest}: {', '.join(sorted(names))} are left out, because a conversion from or to a user-defined "
             "format writes only columns of steps; write the episodes with open_writer to keep texts and values of episodes",
             stacklevel=3,
         )
@@ -357,23 +365,17 @@ def merge(
     return convert(ConcatDataset(opened), dest, dest_format=dest_format, mode=mode, progress=progress, **dest_kwargs)
 
 
-def _plain(mode: str) -> str:
-    """The mode for writers of user-defined formats, which cannot resume."""
-    return validate_write_mode("error" if mode == "resume" else mode)
-
-
-def write_all(source: Any, writer: Any, report: Callable[[str, int, int], None] | None, lost: set[str]) -> dict[str, Any]:
-    """Writes all episodes of a dataset with a writer implemented in Python.
+def write_all(engine: Any, writer: Any, report: Callable[[str, int, int], None] | None, lost: set[str]) -> dict[str, Any]:
+    """Writes all episodes of a dataset of the engine with a writer implemented in Python.
 
     Adds the names of texts and values of episodes, which the writer does not get, to `lost`.
     """
-    engine = engine_of(source)
     lengths = engine.lengths()
     names = [name for name, _, _ in engine.schema() if name not in _tensors.NUMBERING]
-    with writer:
+    with writing(writer, "write_episode") as opened:
         for episode, length in enumerate(lengths):
             run = (np.asarray([value], dtype=np.int64) for value in (episode, 0, length))
-            writer.write_episode(dict(engine.read(names, *run, 1)))
+            opened.write_episode(dict(engine.read(names, *run, 1)))
             lost.update(engine.constants(episode))
             if report is not None:
                 report("convert", episode + 1, len(lengths))

@@ -7,12 +7,24 @@ from pathlib import Path
 
 from .. import _engine
 
-__all__ = ["folder_of", "home_of", "is_module", "is_stored", "located"]
+__all__ = ["check_name", "folder_of", "home_of", "is_module", "is_stored", "located"]
 
 
 def home_of(cache_dir: str | os.PathLike[str] | None) -> Path:
     """The folder in which `checkpoints/` has the checkpoints with a name: `cache_dir`, or `$STABLEWM_HOME` for `None`."""
     return Path(_engine.home() if cache_dir is None else os.path.expanduser(cache_dir))
+
+
+def check_name(what: str, name: str | os.PathLike[str]) -> Path:
+    """The name or the local folder of a checkpoint to write.
+
+    Raises:
+        ValueError: If it is a URI, or its last part is no name, as in `.` or `..`.
+    """
+    path = Path(os.path.expanduser(name))
+    if "://" in str(name) or path.name in ("", ".."):
+        raise ValueError(f"{what}: expected a name or a local folder for the checkpoint, got {str(name)!r}")
+    return path
 
 
 def folder_of(path: Path) -> Path | None:
@@ -39,6 +51,8 @@ def located(name: str, cache_dir: str | os.PathLike[str] | None = None) -> Path 
     A path counts before a name under `$STABLEWM_HOME/checkpoints`, and a name under `cache_dir` before a path. Files and
     folders without a checkpoint count last, so that an error says what is missing.
     """
+    if not name:
+        return None
     home, here = home_of(cache_dir), Path(os.path.expanduser(name))
     named, pulled = (home / "checkpoints" / folder for folder in (name, f"models--{name.replace('/', '--')}"))
     candidates = (here, named, pulled) if cache_dir is None else (named, home / name, here, pulled)

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from .. import _engine
+from ._located import check_name
 
 __all__ = ["Pretrained", "Stored", "stored_names"]
 
@@ -121,9 +122,7 @@ class Pretrained(nn.Module):
 
 def run_path(name: str | os.PathLike[str]) -> Path:
     """The folder of a checkpoint to write: a path, or a name under `$STABLEWM_HOME/checkpoints`."""
-    path = Path(os.path.expanduser(name))
-    if "://" in str(name) or not path.name:
-        raise ValueError(f"path: expected a name or a local folder for the checkpoint, got {str(name)!r}")
+    path = check_name("path", name)
     if path.is_absolute() or len(path.parts) > 1 or str(name).startswith("."):
         return path
     return Path(_engine.home()) / "checkpoints" / path

@@ -21,7 +21,7 @@ from torch import nn
 from .. import _engine, _files
 from ._bounds import bounded
 from ._build import build
-from ._located import home_of, is_stored, located
+from ._located import check_name, home_of, is_stored, located
 from ._weights import check_numbers, lacks_memory, load_into, read_state_dict
 from .checkpoints import module_of
 
@@ -61,13 +61,13 @@ def save_pretrained(
         cache_dir: A folder in place of `$STABLEWM_HOME`.
 
     Raises:
-        ValueError: If the name of the file is no plain name, or that of another file of a checkpoint, a folder is a URI, or
-            the module has an extra state that is no tensor.
+        ValueError: If `run_name` is no name, the name of the file is no plain name, or that of another file of a checkpoint, a
+            folder is a URI, or the module has an extra state that is no tensor.
         FileExistsError: If the folder has a checkpoint of the engine, or a file to replace is none that this function writes.
     """
     if cache_dir is not None:
         cache_dir = _files.local("cache_dir", cache_dir)
-    folder = home_of(cache_dir) / "checkpoints" / _files.local("run_name", run_name)
+    folder = home_of(cache_dir) / "checkpoints" / check_name("run_name", _files.local("run_name", run_name))
     settings, stored = folder / "config.json", folder / filename
     is_plain = filename and Path(filename).name == filename and filename not in ("config.json", "manifest.json")
     if not is_plain or Path(filename).suffix == ".safetensors":

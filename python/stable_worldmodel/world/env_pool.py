@@ -10,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, iterate
 
 from .. import spaces as swm_spaces
+from .._action_spaces import batched
 from .._lazy import lazy
 from ..data import _tensors
 
@@ -60,7 +61,7 @@ class EnvPool:
     @lazy
     def action_space(self) -> spaces.Space[Any]:
         """The action space of all environments together."""
-        return batch_space(self.single_action_space, self.num_envs)
+        return batched(self.single_action_space, self.num_envs)
 
     @property
     def single_observation_space(self) -> spaces.Space[Any]:
@@ -250,7 +251,7 @@ class WorldEnvs(EnvPool):
     @lazy
     def action_space(self) -> spaces.Space[Any]:
         """The action space of all environments together."""
-        return batch_space(self.single_action_space, self.num_envs)
+        return batched(self.single_action_space, self.num_envs)
 
     @lazy
     def single_observation_space(self) -> spaces.Space[Any]:

@@ -222,17 +222,22 @@ class World:
     @property
     def rewards(self) -> np.ndarray:
         """The rewards of the last step, `(num_envs,)`."""
-        return self.infos["reward"][:, 0]
+        return self._column("reward")
 
     @property
     def terminateds(self) -> np.ndarray:
         """Whether the last step terminated the episode, `(num_envs,)`."""
-        return self.infos["terminated"][:, 0]
+        return self._column("terminated")
 
     @property
     def truncateds(self) -> np.ndarray:
         """Whether the last step truncated the episode, `(num_envs,)`."""
-        return self.infos["truncated"][:, 0]
+        return self._column("truncated")
+
+    def _column(self, name: str) -> np.ndarray:
+        """The values `(num_envs,)` of an info column."""
+        _ = self._world  # An error if the world is closed.
+        return self.infos[name][:, 0]
 
     @property
     def single_action_space(self) -> spaces.Space[Any]:
@@ -317,42 +322,48 @@ class World:
                 A list holds the environment seeds of the first episodes; those of later ones follow from it. Random for `None`.
             options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
                 A list holds the options of each environment.
+
+        A reset that fails leaves the seed and the options of the last one.
         """
         factors = self.spec["variation"]
+        reset_text: str | list[str]
         if isinstance(options, Sequence):
             if len(options) != self.num_envs:
                 raise ValueError(f"options: expected {self.num_envs} dicts, one for each environment, got {len(options)}")
-            self._reset_text = [_options.reset(given, factors) for given in options]
+            reset_text = [_options.reset(given, factors) for given in options]
         else:
-            self._reset_text = _options.reset(options, factors)
+            reset_text = _options.reset(options, factors)
         named = self._varied_by(options if isinstance(options, Sequence) else [options])
-        self._varied = self._varied if named is None else named
         single = seed is None or isinstance(seed, (int, np.integer))
         first = [] if single else [_seed(given) for given in seed]  # type: ignore[union-attr]
         if not single and len(first) != self.num_envs:
             raise ValueError(f"seed: expected {self.num_envs} seeds, one for each environment, got {len(first)}")
-        self.seed = _seed(seed) if single else _joined(first)  # type: ignore[arg-type]
-        self._first_seeds = first
-        self._episodes = list(range(self.num_envs))
-        self._next_episode = self.num_envs
-        self._reset_slots([(slot, self._seed_of(slot)) for slot in range(self.num_envs)])
-        self._begin(range(self.num_envs))
+        seed = _seed(seed) if single else _joined(first)  # type: ignore[arg-type]
+        slots = range(self.num_envs)
+        self._reset_engine([(slot, _seed_of(slot, seed, first)) for slot in slots], reset_text)
+        self.seed, self._first_seeds, self._reset_text = seed, first, reset_text
+        self._varied = self._varied if named is None else named
+        self._episodes, self._next_episode = list(slots), self.num_envs
+        self._show_factors(slots)
+        self._begin(slots)
         self._transform()
 
     def _seed_of(self, episode: int) -> int:
         """The environment's seed of an episode since the last `reset`."""
-        if episode < len(self._first_seeds):
-            return self._first_seeds[episode]
-        return _engine.World.episode_seed(self.seed or 0, episode)
+        return _seed_of(episode, self.seed or 0, self._first_seeds)
 
     def _reset_slots(self, starts: list[tuple[int, int]]) -> None:
         """Resets environments, given as pairs of slot and seed, with the options of the last `reset`."""
-        if isinstance(self._reset_text, str):
-            self._world.reset(starts, self._reset_text)
+        self._reset_engine(starts, self._reset_text)
+        self._show_factors([slot for slot, _ in starts])
+
+    def _reset_engine(self, starts: list[tuple[int, int]], options: str | list[str]) -> None:
+        """Resets environments, given as pairs of slot and seed, with the same options, or with those of each environment."""
+        if isinstance(options, str):
+            self._world.reset(starts, options)
         else:
             for slot, seed in starts:
-                self._world.reset([(slot, seed)], self._reset_text[slot])
-        self._show_factors([slot for slot, _ in starts])
+                self._world.reset([(slot, seed)], options[slot])
 
     def _varied_by(self, options: Sequence[Mapping[str, Any] | None]) -> list[str] | None:
         """The factors that the options sample; `None` if they have no `variation`."""
@@ -523,10 +534,16 @@ class World:
             expected = self.envs.action_space.shape
             raise ValueError(f"{what}: got actions of shape {given.shape}, expected {expected}")
         given = given.reshape(want.shape)
-        has_texts = given.dtype == object and any(isinstance(value, (str, bytes)) for value in given.flat)
-        if given.dtype.kind in "cSUmMV" or has_texts:
-            kind = "complex numbers" if given.dtype.kind == "c" else str(given.dtype)
+        others = (str, bytes, complex, np.complexfloating)
+        has_others = given.dtype == object and any(isinstance(value, others) for value in given.flat)
+        if given.dtype.kind in "cSUmMV" or has_others:
+            kinds = {"c": "complex numbers", "O": "complex numbers or texts"}
+            kind = kinds.get(given.dtype.kind, str(given.dtype))
             raise ValueError(f"{what}: expected real actions, got {kind}")
+        if given.dtype == object:
+            # Floats would round large integers.
+            is_whole = all(isinstance(value, (int, np.integer)) and -(2**63) <= int(value) < 2**63 for value in given.flat)
+            given = given.astype(np.int64 if is_whole else np.float64)
         if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
             raise ValueError(f"{what}: expected finite actions, got {given[active]}")
         if want.dtype.kind != "f":
@@ -646,17 +663,17 @@ class World:
         policy = self._chosen(policy)
         if writer is None and format is None:
             format = _FORMAT_OF_SUFFIX.get(Path(path or "").suffix)
-        first = 0
+        first, kind = 0, None
         if path is not None and given is not None and writer is None and format not in _engine.formats():
-            from ..data.format import foreign_episodes, foreign_writer
+            from ..data.format import foreign_episodes, user_defined
 
+            kind = user_defined(given, format)
             first = foreign_episodes(given, format, mode)
-            writer = foreign_writer(given, format, mode)
-        if codec is not None and writer is not None:
+        is_stored = writer is None and kind is None
+        if codec is not None and not is_stored:
             raise ValueError(
                 "codec: the writer decides how frames are stored; leave codec out, or pass a path of another format"
             )
-        is_stored = writer is None
         begun = stored_policy(path, format) if is_stored and path is not None and mode in ("append", "resume") else ""
         # A policy of the user may learn between collections: its weights are compared if the dataset was begun with them.
         learns = (mode == "append" or bool(begun)) and is_overridden(policy, "get_action") and ",weights=" not in begun
@@ -680,19 +697,16 @@ class World:
             "strict_finite": bool(strict_finite),
             "wrappers": wrappers,
         }
-        if writer is not None:
-            failed: BaseException | None = None
-            with writer as opened:
-                try:
-                    config["episodes"] = max(episodes - first, 0) if mode == "resume" else episodes
-                    counts = self._collect(policy, None, opened, None, "create", None, config, progress)
-                    return {**counts, "episodes": first + counts["episodes"]}
-                except BaseException as error:
-                    failed = error
-                    raise
-            # The writer suppressed the error, but there is no collection to report.
-            assert failed is not None
-            raise failed
+        if not is_stored:
+            from ..data.format import open_foreign, writing
+
+            if kind is not None:
+                # Last, because a writer that replaces a dataset may delete it at once.
+                writer = open_foreign(kind, given, "append" if mode == "resume" else mode)
+            config["episodes"] = max(episodes - first, 0) if mode == "resume" else episodes
+            with writing(writer, "write_episode") as opened:
+                counts = self._collect(policy, None, opened, None, "create", None, config, progress)
+            return {**counts, "episodes": first + counts["episodes"]}
         assert path is not None
         if mode == "append" or (mode == "resume" and problem):
             stored = _engine.World.stored(path, format) or 0
@@ -927,6 +941,11 @@ def _seed(seed: int | None) -> int:
     if seed is None:
         return _random_seed()
     return _options.count("seed", seed, least=0)
+
+
+def _seed_of(episode: int, seed: int, first: Sequence[int]) -> int:
+    """The environment's seed of an episode since a reset with a seed, and with the seeds of the first episodes, if given."""
+    return first[episode] if episode < len(first) else _engine.World.episode_seed(seed, episode)
 
 
 def _joined(seeds: Sequence[int]) -> int:

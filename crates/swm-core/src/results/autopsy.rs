@@ -225,6 +225,16 @@ impl Autopsy {
     /// The number of resamples of the bootstrap.
     pub const RESAMPLES: usize = 2000;
 
+    /// What was found on the failures: nothing if there are none.
+    pub fn on_failures<T>(&self, found: T) -> Option<T> {
+        (!self.repairs.is_empty()).then_some(found)
+    }
+
+    /// What was found on the starts that the selection run solved: nothing if there are none.
+    pub fn on_solved<T>(&self, found: T) -> Option<T> {
+        (self.starts > self.repairs.len()).then_some(found)
+    }
+
     /// The autopsy of the ingredients that the arms have. `selection` is the run that selects the failures; there is one arm
     /// for each coalition of the [`game`] of the ingredients, in any order. The bootstrap draws with `key`.
     ///

@@ -9,6 +9,9 @@ use swm_core::{Error, Result};
 pub struct ColumnStats {
     /// Number of rows whose value of this element is not NaN.
     pub count: Vec<u64>,
+    /// Number of rows before the last of their episode that have a NaN in any element: one number for the column.
+    #[serde(default)]
+    pub incomplete: u64,
     /// Mean.
     pub mean: Vec<f64>,
     /// Population standard deviation.
@@ -32,12 +35,14 @@ pub fn column_stats(reader: &dyn Reader, column: &str, episodes: Option<&[usize]
     // Welford's algorithm, which stays accurate if the mean is much larger than the standard deviation.
     let mut stats = ColumnStats {
         count: vec![0; n],
+        incomplete: 0,
         mean: vec![0.0; n],
         std: vec![0.0; n],
         min: vec![f64::INFINITY; n],
         max: vec![f64::NEG_INFINITY; n],
     };
-    for_each_row(reader, column, episodes, |row| {
+    for_each_row(reader, column, episodes, |row, is_last| {
+        stats.incomplete += u64::from(!is_last && row.iter().any(|value| value.is_nan()));
         for (k, &value) in row.iter().enumerate().filter(|(_, value)| !value.is_nan()) {
             stats.count[k] += 1;
             let delta = value - stats.mean[k];
@@ -58,12 +63,12 @@ pub fn column_stats(reader: &dyn Reader, column: &str, episodes: Option<&[usize]
     Ok(stats)
 }
 
-/// Calls `each` with every row of a column, over some episodes (all for `None`).
+/// Calls `each` with every row of a column, and whether it is the last of its episode, over some episodes (all for `None`).
 fn for_each_row(
     reader: &dyn Reader,
     column: &str,
     episodes: Option<&[usize]>,
-    mut each: impl FnMut(&[f64]),
+    mut each: impl FnMut(&[f64], bool),
 ) -> Result<()> {
     if reader.schema().column(column)?.is_image() {
         return Err(Error::mismatch(
@@ -91,8 +96,13 @@ fn for_each_row(
         rows += episode.length;
         if rows >= ROWS_PER_READ || i + 1 == positions.len() {
             let batch = reader.read(&[column], &pending)?;
-            for row in 0..batch.rows() {
-                each(&batch.row(row).to_f64(column)?);
+            if batch.rows() != rows {
+                let given = format!("{} rows of '{column}'", batch.rows());
+                return Err(Error::mismatch("reading a dataset", given, format!("{rows} rows")));
+            }
+            let is_last = pending.iter().flat_map(|range| (1..=range.length).map(|step| step == range.length));
+            for (row, is_last) in is_last.enumerate() {
+                each(&batch.row(row).to_f64(column)?, is_last);
             }
             pending.clear();
             rows = 0;
@@ -126,7 +136,7 @@ pub fn column_quantiles(
         });
     }
     let mut values: Vec<Vec<f64>> = vec![];
-    for_each_row(reader, column, episodes, |row| {
+    for_each_row(reader, column, episodes, |row, _| {
         values.resize(row.len(), vec![]);
         values.iter_mut().zip(row).filter(|(_, value)| !value.is_nan()).for_each(|(values, &value)| values.push(value));
     })?;

@@ -52,6 +52,7 @@ pub struct Pulled {
     /// The URI with its commit.
     pub pinned: String,
     /// The file or folder on this machine.
+    #[serde(serialize_with = "swm_core::files::serialize_path")]
     pub path: PathBuf,
     /// The number of files.
     pub files: usize,

@@ -174,9 +174,7 @@ impl<'a> Player<'a> {
             }
             Request::Finish {} => {
                 let recorder = self.recorder.take().ok_or_else(nothing_recorded)?;
-                let episodes = recorder.episodes();
-                recorder.finish()?;
-                self.out.reply(&Reply::Recording { dataset: None, episodes, rows: 0, complete: false });
+                self.end(recorder)?;
                 self.send_frame()
             }
         }
@@ -198,13 +196,27 @@ impl<'a> Player<'a> {
         Ok(())
     }
 
-    /// Records from now on; another recording is ended.
+    /// Records from now on; another recording is ended. One into another dataset that cannot begin leaves the session as it is.
     fn record(&mut self, dataset: &str) -> Result<()> {
         let no_folder = || Error::config("recording", "the lab has no folder of datasets", "set STABLEWM_HOME");
         let folder = self.lab.datasets.paths().first().ok_or_else(no_folder)?;
-        self.recorder.take().map_or(Ok(()), Recorder::finish)?;
-        self.recorder = Some(Recorder::start(folder, dataset, &self.world, &self.settings()?)?);
-        self.reset()
+        let settings = self.settings()?;
+        // One writer has a dataset at a time.
+        if let Some(same) = self.recorder.take_if(|recorder| recorder.name() == dataset) {
+            self.end(same)?;
+        }
+        let started = Recorder::start(folder, dataset, &self.world, &settings)?;
+        let ended = self.recorder.replace(started).map_or(Ok(()), Recorder::finish);
+        let reset = self.reset();
+        ended.and(reset)
+    }
+
+    /// Ends a recording, and tells the page.
+    fn end(&self, recorder: Recorder) -> Result<()> {
+        let episodes = recorder.episodes();
+        let ended = recorder.finish();
+        self.out.reply(&Reply::Recording { dataset: None, episodes, rows: 0, complete: false });
+        ended
     }
 
     /// What the manifest of a recording says of its wrappers.

@@ -14,6 +14,7 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::Builder;
 use std::time::Duration;
 use swm_core::Error;
+use swm_core::text::one_line;
 use tokio::sync::{Semaphore, mpsc, watch};
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Error as WsError;
@@ -151,6 +152,8 @@ async fn read<S: Session>(
             },
             Err(error) => {
                 malformed += 1;
+                // It quotes the message.
+                let error = one_line(&error.to_string());
                 tracing::warn!("a page sent a malformed message ({error})");
                 format!("malformed message: {error}")
             }

@@ -123,6 +123,33 @@ fn kept_episodes_are_stored_when_the_lab_ends() {
 }
 
 #[test]
+fn a_refused_recording_leaves_the_one_that_runs() {
+    let lab = TestLab::start();
+    let mut live = lab.live("swm/TwoRoom-v1");
+    live.send(&json!({"type": "drive", "by": "hand"}));
+    live.send(&json!({"type": "record", "dataset": "good"}));
+    live.reply("recording");
+    demonstrate(&mut live, 1, 3);
+    live.send(&json!({"type": "record", "dataset": "../x"}));
+    let message = live.reply("failed")["message"].to_string();
+    assert!(message.contains("'../x' is not one"), "{message}");
+    live.send(&json!({"type": "keep"}));
+    while live.reply("recording")["episodes"] != 1 {}
+    // The same dataset again, and another one.
+    live.send(&json!({"type": "record", "dataset": "good"}));
+    while live.reply("recording")["rows"] != 1 {}
+    live.send(&json!({"type": "record", "dataset": "other"}));
+    while live.reply("recording")["dataset"] != "other" {}
+    // The page learns that a recording has ended whose dataset another program replaced.
+    let path = lab.home.path().join("datasets/other.lance");
+    fs::remove_dir_all(&path).expect("deleting the dataset");
+    fs::write(&path, "x").expect("a file in its place");
+    live.send(&json!({"type": "record", "dataset": "other"}));
+    while !live.reply("recording")["dataset"].is_null() {}
+    live.reply("failed");
+}
+
+#[test]
 fn the_name_of_a_recording_without_episodes_is_free() {
     let lab = TestLab::start();
     for (environment, dataset) in [("swm/TwoRoom-v1", "none"), ("swm/PushT-v1", "none")] {

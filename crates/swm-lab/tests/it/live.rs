@@ -141,6 +141,17 @@ fn oversized_messages_close_the_socket_and_the_lab_lives() {
     assert_eq!(lab.get("api/envs").0, 200);
 }
 
+#[test]
+fn malformed_messages_are_reported_in_one_short_line() {
+    let lab = TestLab::start();
+    let mut live = lab.live("swm/TwoRoom-v1");
+    live.reply("started");
+    live.send(&json!({"type": "step", (format!("\u{202e}evil\nWARN a forged line {}", "x".repeat(8000))): 1}));
+    let message = live.reply("failed")["message"].as_str().unwrap_or_default().to_owned();
+    assert!(message.contains("malformed message: unknown field `\\u{202e}evil WARN a forged line x"), "{message}");
+    assert!(message.chars().count() < 250 && !message.contains(['\n', '\u{202e}']), "{message}");
+}
+
 /// A message made of a valid one by random changes, or of random bytes.
 fn fuzzed(i: u64) -> Message {
     use rand::Rng as _;

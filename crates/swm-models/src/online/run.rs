@@ -25,6 +25,7 @@ use swm_data::{LoaderConfig, ReplayBuffer, ReplayConfig, ReplayLoader, WriteOpti
 #[derive(Clone, Debug, Serialize)]
 pub struct OnlineSummary {
     /// The run folder, which holds the checkpoint.
+    #[serde(serialize_with = "files::serialize_path")]
     pub checkpoint: PathBuf,
     /// The hash of the weights.
     pub weights: String,
@@ -362,7 +363,8 @@ impl Run<'_> {
         let what = format!("the loss or the gradient at training step {}", step + 1);
         let values = format!("{}, gradient norm {}", failed_batch::describe(&update.metrics), update.gradient_norm);
         let fix = "lower optim.lr; the last checkpoint, if any, is kept";
-        Err(failed_batch::error(self.out, &batch, what, &values, fix))
+        let repair = "the environment returned NaN in these columns: correct it, and train again in another folder";
+        Err(failed_batch::error(self.out, &batch, what, &values, repair, fix))
     }
 
     /// Evaluates the present weights, saves the weights of the best evaluation so far, and returns the mean return.

@@ -59,12 +59,11 @@ impl ColumnInfo {
                 "remove or repair the episodes with infinite or huge values, which `swm inspect` shows in the ranges";
             return Err(Error::config(format!("column '{}' of the training data", spec.name), given, fix));
         }
-        // The last row of an episode has no action.
-        let expected: usize = reader.episodes().iter().map(|episode| episode.length.saturating_sub(1)).sum();
-        let expected = expected as u64;
-        if spec.name == ACTION && stats.count.iter().any(|&count| count < expected) {
-            let given = format!("has {:?} values at {expected} steps: some have no action", stats.count);
-            let fix = "remove or repair the episodes with NaN before their last row";
+        // The last row of an episode may have no action.
+        if spec.name == ACTION && stats.incomplete > 0 {
+            let given = format!("has NaN in {} rows before the last of their episode", stats.incomplete);
+            let fix = "remove or repair these episodes, which `swm doctor` lists; an action stands in the row of the \
+                       observation in which it was taken";
             return Err(Error::config(format!("column '{ACTION}' of the training data"), given, fix));
         }
         Ok(Self { shape: spec.shape.clone(), mean: stats.mean, std: stats.std, min: stats.min, max: stats.max })

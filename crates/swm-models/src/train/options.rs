@@ -38,6 +38,7 @@ impl Default for TrainOptions {
 #[derive(Clone, Debug, Serialize)]
 pub struct TrainSummary {
     /// The run folder, which holds the checkpoint.
+    #[serde(serialize_with = "swm_core::files::serialize_path")]
     pub checkpoint: PathBuf,
     /// The hash of the weights.
     pub weights: String,

@@ -346,7 +346,8 @@ impl<'a> Run<'a> {
     fn not_finite(&self, what: &str, step: usize, batch: &Batch, metrics: &[(&'static str, f64)]) -> Error {
         let what = format!("{what} at training step {step}");
         let fix = "lower optim.lr or the weights of the loss, or lengthen schedule.warmup; the last checkpoint, if any, is kept";
-        failed_batch::error(self.out, batch, what, &failed_batch::describe(metrics), fix)
+        let repair = "remove or repair the episodes with NaN, which `swm doctor` lists";
+        failed_batch::error(self.out, batch, what, &failed_batch::describe(metrics), repair, fix)
     }
 
     /// Logs the means of the metrics over the validation batches and returns the loss.

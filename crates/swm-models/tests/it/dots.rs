@@ -114,8 +114,13 @@ impl Dots {
     }
 
     /// Sets the first action of an episode.
-    pub fn with_action(mut self, episode: usize, action: [f32; 2]) -> Self {
-        self.rows.row_mut(episode * LENGTH).set(1, &action);
+    pub fn with_action(self, episode: usize, action: [f32; 2]) -> Self {
+        self.with_action_at([episode, 0], action)
+    }
+
+    /// Sets the action of an episode at a step.
+    pub fn with_action_at(mut self, [episode, step]: [usize; 2], action: [f32; 2]) -> Self {
+        self.rows.row_mut(episode * LENGTH + step).set(1, &action);
         self
     }
 }

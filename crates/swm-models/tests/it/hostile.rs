@@ -387,6 +387,20 @@ fn infinite_and_missing_actions_are_refused_before_training() {
 }
 
 #[test]
+fn actions_of_last_rows_do_not_hide_missing_ones() {
+    let last = |dots: crate::dots::Dots| dots.with_action_at([0, 23], [0.5; 2]).with_action_at([1, 23], [0.5; 2]);
+    let info = |dots: &crate::dots::Dots| DatasetInfo::from_reader(dots, &[], false);
+    info(&last(crate::dots::Dots::new(2, 0))).expect("actions in all rows");
+    info(&crate::dots::Dots::new(2, 0).with_action_at([0, 23], [0.5; 2])).expect("one action in a last row");
+    for action in [[f32::NAN; 2], [0.0, f32::NAN]] {
+        let dots = last(crate::dots::Dots::new(2, 0)).with_action_at([1, 7], action).with_action_at([1, 8], action);
+        let error = info(&dots).expect_err("missing actions").to_string();
+        assert!(error.contains("column 'action'") && error.contains("NaN in 2 rows"), "{error}");
+        assert!(error.contains("in which it was taken"), "{error}");
+    }
+}
+
+#[test]
 fn columns_that_vary_too_little_for_a_model_are_refused() {
     let columns = ["position".to_owned()];
     let info = |dots: &crate::dots::Dots, bounded| DatasetInfo::for_training(dots, &columns, bounded);

@@ -26,6 +26,7 @@ use super::guarded_model::{GuardedModel, catch_panic};
 use super::history::History;
 use super::observer::{BetweenIterations, PlanObserver};
 use super::trace_log::{PlanRecord, TraceLog};
+use crate::search::count_values;
 use std::time::Instant;
 use swm_core::run::Interrupt;
 use swm_core::{Action, Batch, ColumnSpec, CostModel, EnvPool, EnvSpec, Error, Key, Plan, PlanProblem};
@@ -98,6 +99,8 @@ impl MpcPolicy {
         let codec = ActionCodec::new(spec, scale, config.action_block)?;
         solver.check_space(codec.space())?;
         let (dim, width) = (codec.space().dim(), codec.width());
+        let steps = config.horizon.max(config.history);
+        count_values("MPC plans".to_owned(), [slots, steps, dim], None)?;
         let slot = Slot {
             key: Key::new(0),
             plans: 0,

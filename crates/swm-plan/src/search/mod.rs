@@ -23,6 +23,7 @@ pub use elites::{Elites, smallest};
 pub use gaussian::Gaussian;
 pub use optimizer::{Adam, Memory, Optimizer, RmsProp, Sgd, clip_norm};
 pub use population::{Population, add_noise, average, iterate};
+pub(crate) use problem::count_values;
 pub use problem::{
     Bounds, UNWRITTEN, constrained, continuous, differentiable, discrete, evaluate, latent, misfit, offers,
 };

@@ -2,12 +2,12 @@
 
 use super::elites::Elites;
 use super::normal_noise::RUN;
-use super::problem::evaluate;
+use super::problem::{count_values, evaluate, sizes};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
-use swm_core::{Candidates, CostModel, Error, Iteration, Key, Plan, PlanProblem, PlanTrace, Result, limits};
+use swm_core::{Candidates, CostModel, Iteration, Key, Plan, PlanProblem, PlanTrace, Result};
 
 /// Candidate action sequences of several environments, and their costs.
 pub struct Population {
@@ -30,29 +30,17 @@ const SMALL: usize = 1 << 14;
 /// The time for which threads without work stay awake at least.
 const AWAKE: Duration = Duration::from_micros(5);
 
-/// The largest number of values of all candidates of one iteration.
-pub const MAX_VALUES: usize = limits::CANDIDATE_VALUES.max;
-
 impl Population {
     /// Creates a population of zeros with `samples` candidates for each environment. Draws are keyed by `solver`, so
     /// they differ from the draws of other solvers.
     ///
     /// # Errors
-    /// When the candidates have more than `MAX_VALUES` values.
+    /// When the candidates have more values than `limits::CANDIDATE_VALUES`.
     pub fn new(solver: &str, problem: &PlanProblem<'_>, samples: usize) -> Result<Self> {
+        let values = count_values(format!("candidates of {solver}"), sizes(problem), Some(samples))?;
         let keys: Vec<Key> = problem.keys.iter().map(|key| key.with(solver)).collect();
-        let (envs, horizon, dim) = (keys.len(), problem.horizon, problem.space.dim());
-        let values = [samples, horizon, dim].into_iter().try_fold(envs, usize::checked_mul);
-        let Some(values) = values.filter(|values| *values <= MAX_VALUES) else {
-            return Err(Error::config(
-                format!("candidates of {solver}"),
-                format!(
-                    "{envs} environments x {samples} samples x {horizon} steps x {dim} values do not fit into memory"
-                ),
-                "plan with fewer samples, steps or parallel environments",
-            ));
-        };
-        let (actions, costs) = (vec![0.0; values], vec![0.0; envs * samples]);
+        let (horizon, dim) = (problem.horizon, problem.space.dim());
+        let (actions, costs) = (vec![0.0; values], vec![0.0; keys.len() * samples]);
         Ok(Self { keys, samples, horizon, dim, actions, costs, asleep: true })
     }
 

@@ -5,7 +5,7 @@
 
 use crate::entry::{ActionKind, Need, SolverEntry};
 use swm_core::{Candidates, Constrained, CostModel, DifferentiableCost, LatentDynamics};
-use swm_core::{Error, PlanProblem, PlanSpace, Result};
+use swm_core::{Error, PlanProblem, PlanSpace, Result, limits};
 
 /// The bounds of one model step.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,8 +32,8 @@ impl Bounds<'_> {
 /// Checks a problem with continuous actions; returns its bounds.
 ///
 /// # Errors
-/// When the solver does not fit the problem or the model, the horizon is 0, or the bounds or the initial guess
-/// are invalid.
+/// When the solver does not fit the problem or the model, the horizon is 0 or too large, or the bounds or the initial
+/// guess are invalid.
 pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<Bounds<'a>> {
     check_fit(solver, cost, problem)?;
     let PlanSpace::Continuous { low, high } = problem.space else {
@@ -55,7 +55,7 @@ pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &
             "the lower bound must not exceed the upper one",
         ));
     }
-    check_size(problem)?;
+    check_size(solver, problem)?;
     check_init(problem)?;
     Ok(Bounds { low, high })
 }
@@ -66,8 +66,8 @@ pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &
 /// without preference.
 ///
 /// # Errors
-/// When the solver does not fit the problem or the model, the horizon is 0, or the choices or the initial guess
-/// are invalid.
+/// When the solver does not fit the problem or the model, the horizon is 0 or too large, or the choices or the initial
+/// guess are invalid.
 pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<&'a [usize]> {
     check_fit(solver, cost, problem)?;
     let PlanSpace::Discrete { choices } = problem.space else {
@@ -84,7 +84,7 @@ pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &Pl
             "offer at least 1 option",
         ));
     }
-    check_size(problem)?;
+    check_size(solver, problem)?;
     check_init(problem)?;
     if let Some(weight) = problem.init.unwrap_or_default().iter().find(|&&weight| weight < 0.0) {
         return Err(Error::OutOfSpace {
@@ -195,16 +195,39 @@ pub(super) fn check_costs(costs: &[f32], samples: usize, iteration: usize) -> Re
     })
 }
 
-fn check_size(problem: &PlanProblem<'_>) -> Result<()> {
-    let (horizon, dim) = (problem.horizon, problem.space.dim());
-    if horizon > 0 && dim > 0 {
-        return Ok(());
+/// The number of values of one plan for each environment, or of `samples` candidates.
+///
+/// # Errors
+/// When there are more values than [`limits::CANDIDATE_VALUES`]; `what` names them.
+pub(crate) fn count_values(what: String, [envs, steps, dim]: [usize; 3], samples: Option<usize>) -> Result<usize> {
+    let values = limits::product([envs, samples.unwrap_or(1), steps, dim]);
+    if values <= limits::CANDIDATE_VALUES.max {
+        return Ok(values);
     }
+    let (times, fewer) = samples.map_or_else(Default::default, |n| (format!(" x {n} samples"), "samples, "));
     Err(Error::config(
-        "planning horizon",
-        format!("{horizon} model steps of dimension {dim}"),
-        "plan at least 1 model step with actions of at least 1 dimension",
+        what,
+        format!("{envs} environments{times} x {steps} steps x {dim} values do not fit into memory"),
+        format!("plan with fewer {fewer}steps or parallel environments, or smaller action blocks"),
     ))
+}
+
+/// The sizes of the plans of a problem, `[envs, horizon, dim]`.
+pub(super) fn sizes(problem: &PlanProblem<'_>) -> [usize; 3] {
+    [problem.keys.len(), problem.horizon, problem.space.dim()]
+}
+
+/// Checks the sizes of a problem, before a solver allocates by them.
+fn check_size(solver: &SolverEntry, problem: &PlanProblem<'_>) -> Result<()> {
+    let (horizon, dim, most) = (problem.horizon, problem.space.dim(), limits::MODEL_STEPS.max);
+    if !(1..=most).contains(&horizon) || dim == 0 {
+        return Err(Error::config(
+            "planning horizon",
+            format!("{horizon} model steps of dimension {dim}"),
+            format!("plan 1 to {most} model steps with actions of at least 1 dimension"),
+        ));
+    }
+    count_values(format!("plans of {}", solver.id), sizes(problem), None).map(|_| ())
 }
 
 fn check_init(problem: &PlanProblem<'_>) -> Result<()> {

@@ -202,6 +202,12 @@ fn errors_name_invalid_settings() {
     assert!(make(far, scale.clone(), &spec(1.0)).contains("6 model steps to execute, 5 planned"));
     let none = MpcConfig { horizon: 0, ..MpcConfig::default() };
     assert!(make(none, scale.clone(), &spec(1.0)).contains("MPC horizon"));
+    let huge = MpcConfig { horizon: 10_000, action_block: 10_000, ..MpcConfig::default() };
+    let wide = EnvSpec { action_space: Space::uniform_box([11], DType::Float32, -1.0, 1.0), ..spec(1.0) };
+    assert!(
+        make(huge, ActionScale::identity(11), &wide)
+            .contains("1 environments x 10000 steps x 110000 values do not fit")
+    );
     assert!(make(MpcConfig::default(), ActionScale::identity(2), &spec(1.0)).contains("2 means"));
     let flat = ActionScale { mean: vec![0.0], std: vec![0.0] };
     assert!(make(MpcConfig::default(), flat, &spec(1.0)).contains("above 0"));

@@ -1,5 +1,6 @@
 //! Common behaviour of the sampling solvers: initial guess, deadline, traces, bounds, and errors.
 
+use crate::solvers::TRIALS;
 use crate::toys::{Model, Toy, solve, toy};
 use serde_json::{Value, json};
 use std::time::Instant;
@@ -188,4 +189,22 @@ fn errors_name_invalid_problems() {
     let choices = PlanSpace::Discrete { choices: &[2] };
     let negative = [1.0, -1.0, 0.0, 0.0];
     assert!(message("categorical_cem", 1, choices, Some(&negative)).contains("at least 0"));
+    let many = PlanSpace::Discrete { choices: &[usize::MAX, 2] };
+    let error = message("categorical_cem", 3, many, None);
+    assert!(error.contains("values do not fit into memory") && !error.contains("samples"), "{error}");
+}
+
+#[test]
+fn plans_that_do_not_fit_into_memory_are_refused_before_it_is_asked_for() {
+    for trial in TRIALS {
+        let toy = toy(trial.near[0].0);
+        for horizon in [10_001, 1 << 36, 1 << 60, usize::MAX] {
+            let space = toy.space;
+            let problem =
+                PlanProblem { horizon, space, keys: &[Key::new(0)], init: None, deadline: None, observer: None };
+            let error = make(trial.solver, &json!({})).solve(&mut Model::new(toy, &[0]), problem);
+            let error = error.expect_err("too long").to_string();
+            assert!(error.contains(&format!("{horizon} model steps")) && error.contains("1 to 10000"), "{error}");
+        }
+    }
 }

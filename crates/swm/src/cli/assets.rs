@@ -1,6 +1,6 @@
 //! `swm assets`: the third-party libraries, models, meshes and Python packages that environments require.
 
-use super::{emit, emit_json, eprint, table};
+use super::{as_texts, emit, emit_json, eprint, table};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -130,7 +130,7 @@ pub fn assets(args: &AssetsArgs, as_json: bool) -> anyhow::Result<()> {
                 folders.push(item.install()?);
             }
             if as_json {
-                return emit_json(&folders);
+                return emit_json(&as_texts(&folders));
             }
             folders.iter().for_each(|folder| emit(&format!("{}\n", folder.display())));
             Ok(())
@@ -161,7 +161,7 @@ fn list(as_json: bool) -> anyhow::Result<()> {
                 "version": item.version(),
                 "summary": item.summary(),
                 "installed": item.is_installed(),
-                "folder": item.folder(),
+                "folder": item.folder().to_string_lossy(),
             })
         });
         return emit_json(&all.collect::<Vec<Value>>());

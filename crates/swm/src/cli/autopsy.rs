@@ -311,25 +311,23 @@ fn text(found: &Autopsy) -> String {
         wrapped(&finding.to_string())
     );
     let header = ["ingredient", "recovers of failures", "alone", "ranks first"];
-    let rows = contributions.iter().map(|found| {
+    let rows = contributions.iter().map(|contribution| {
         vec![
-            format!("{} {}", found.ingredient.letter(), found.ingredient.summary()),
-            signed(&found.recovered),
-            signed(&found.alone),
-            format!("{:.0} %", 100.0 * found.first),
+            format!("{} {}", contribution.ingredient.letter(), contribution.ingredient.summary()),
+            signed(found.on_failures(&contribution.recovered)),
+            signed(found.on_failures(&contribution.alone)),
+            found.on_failures(contribution.first).map_or("–".to_owned(), |first| format!("{:.0} %", 100.0 * first)),
         ]
     });
     text += &format!("\n{}", table(&header, rows));
     let rows = arms.iter().map(|arm| {
-        let of_unchanged = |estimate: &Estimate| {
-            if arm.ingredients.is_empty() { "–".to_owned() } else { signed(estimate) }
-        };
+        let is_changed = !arm.ingredients.is_empty();
         let Estimate { value, low, high } = arm.success;
         vec![
             letters(&arm.ingredients),
             format!("{:.0} % [{:.0}, {:.0}]", 100.0 * value, 100.0 * low, 100.0 * high),
-            of_unchanged(&arm.recovered),
-            of_unchanged(&arm.harmed),
+            signed(found.on_failures(&arm.recovered).filter(|_| is_changed)),
+            signed(found.on_solved(&arm.harmed).filter(|_| is_changed)),
         ]
     });
     text += &format!("\n{}", table(&["arm", "success", "recovered", "harmed"], rows));
@@ -381,8 +379,10 @@ fn wrapped(sentence: &str) -> String {
 }
 
 /// A difference of shares, in percent.
-fn signed(Estimate { value, low, high }: &Estimate) -> String {
-    format!("{:+.0} % [{:+.0}, {:+.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
+fn signed(shares: Option<&Estimate>) -> String {
+    shares.map_or("–".to_owned(), |Estimate { value, low, high }| {
+        format!("{:+.0} % [{:+.0}, {:+.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
+    })
 }
 
 /// The smallest sets of ingredients that solve a failure.
@@ -427,6 +427,27 @@ mod tests {
             let widest = text.lines().map(|line| line.trim_end().chars().count()).max();
             assert!(widest.is_some_and(|widest| widest <= COLUMNS), "{widest:?}: {text}");
         }
+    }
+
+    #[test]
+    fn rates_of_no_starts_are_not_shown() {
+        let some = Estimate { value: 0.5, low: 0.5, high: 0.5 };
+        let (ingredient, none) = (Ingredient::Dynamics, Estimate::default());
+        let repair = |start| Repair { start, row: None, sets: vec![] };
+        let shown = |failures: usize, recovered, harmed| {
+            let found = Autopsy {
+                starts: 2,
+                selection: Proportion::wilson(2 - failures, 2),
+                planning_seeds: 3,
+                contributions: vec![Contribution { ingredient, recovered, alone: recovered, first: 0.12 }],
+                arms: vec![Arm { ingredients: vec![ingredient], success: some, recovered, harmed }],
+                finding: Finding::TooFew,
+                repairs: (0..failures).map(repair).collect(),
+            };
+            let text = text(&found);
+            ["+0 % [+0, +0]", "12 %"].map(|part| text.matches(part).count())
+        };
+        assert_eq!([shown(2, some, none), shown(0, none, some), shown(1, some, none)], [[0, 1], [0, 0], [1, 1]]);
     }
 
     #[test]

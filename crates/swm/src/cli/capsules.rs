@@ -71,7 +71,8 @@ pub fn pack(args: &PackArgs, context: &Context) -> anyhow::Result<()> {
     let _lock = output_folder::claim_file(&args.output)?;
     let hash = packed.write_own(&args.output)?;
     if context.json {
-        return emit_json(&json!({"path": args.output, "hash": hash, "weights": packed.weights_hash()}));
+        let path = args.output.to_string_lossy();
+        return emit_json(&json!({"path": path, "hash": hash, "weights": packed.weights_hash()}));
     }
     emit(&format!("{}\n", args.output.display()));
     Ok(())

@@ -1,7 +1,7 @@
 //! `swm checkpoints`: lists, shows, verifies, packs, imports, exports and removes checkpoints.
 
 use super::capsules::{self, CapsuleInfo, ExportFormat, PackArgs};
-use super::{Context, emit, emit_json, eprint, table};
+use super::{Context, as_texts, emit, emit_json, eprint, table};
 use crate::capsule::Verification;
 use crate::home::{self, names_in};
 use crate::zoo;
@@ -113,7 +113,7 @@ fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
     let (path, info) = load(given)?;
     if as_json {
         return emit_json(&json!({
-            "path": path,
+            "path": path.to_string_lossy(),
             "family": info.family,
             "weights": info.weights,
             "env": info.dataset_info.env,
@@ -257,7 +257,7 @@ fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -
     };
     let weights = weights?;
     if as_json {
-        return emit_json(&json!({"path": out, "weights": weights}));
+        return emit_json(&json!({"path": out.to_string_lossy(), "weights": weights}));
     }
     emit(&format!("{}\n", out.display()));
     Ok(())
@@ -266,7 +266,7 @@ fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -
 fn export(given: &str, folder: &Path, format: Option<ExportFormat>, as_json: bool) -> anyhow::Result<()> {
     capsules::export_as(given, folder, format)?;
     if as_json {
-        return emit_json(&json!({"path": folder}));
+        return emit_json(&json!({"path": folder.to_string_lossy()}));
     }
     emit(&format!("{}\n", folder.display()));
     Ok(())
@@ -290,7 +290,7 @@ fn remove(given: &str, yes: bool, as_json: bool) -> anyhow::Result<()> {
     }
     let remaining = run_folder::remove(&path)?;
     if as_json {
-        return emit_json(&json!({"removed": path, "remaining": remaining}));
+        return emit_json(&json!({"removed": path.to_string_lossy(), "remaining": as_texts(&remaining)}));
     }
     emit(&format!("removed the checkpoint {}\n", path.display()));
     if !remaining.is_empty() {

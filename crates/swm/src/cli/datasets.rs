@@ -1,7 +1,7 @@
 //! `swm datasets`, `swm formats` and `swm preview`: list datasets and formats, commit shards, write previews.
 
 use super::progress::{StageDisplay, print_summary};
-use super::{emit, emit_json, table};
+use super::{as_texts, emit, emit_json, table};
 use crate::home::{names_in, open_dataset as open};
 use crate::{collect_target, data, home};
 use clap::{Args, Subcommand};
@@ -142,7 +142,7 @@ pub fn preview(args: &PreviewArgs, as_json: bool) -> anyhow::Result<()> {
     drop(display);
     print_summary("preview", &format!("{episodes} episodes in {}", args.output.display()));
     if as_json {
-        return emit_json(&json!({"files": written}));
+        return emit_json(&json!({"files": as_texts(&written)}));
     }
     emit(&written.iter().map(|path| format!("{}\n", path.display())).collect::<String>());
     Ok(())

@@ -111,7 +111,8 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let seconds = start.elapsed().as_secs_f64();
     if context.json {
         return emit_json(&json!({
-            "report": page, "dataset": data, "checkpoint": model, "results": found, "seconds": seconds,
+            "report": page.to_string_lossy(), "dataset": data.to_string_lossy(), "checkpoint": model.to_string_lossy(),
+            "results": found, "seconds": seconds,
         }));
     }
     emit(&summary(&found));

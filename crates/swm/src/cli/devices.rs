@@ -9,12 +9,12 @@ use swm_models::device::{self, Choice, Kind};
 /// The flag `--device`.
 #[derive(clap::Args)]
 pub struct DeviceArgs {
-    /// Device of the models: cpu, vulkan[:I], cuda[:I] or auto
+    /// Device of the models: cpu, vulkan[:I], cuda[:I] or auto (default: cpu)
     ///
     /// `swm devices` lists them. auto is the first GPU that passes a test computation, else the CPU. A GPU's matrix products have the
     /// precision after a comma: cuda:0,bf16.
-    #[arg(long, default_value = "cpu")]
-    pub device: String,
+    #[arg(long)]
+    pub device: Option<String>,
 }
 
 /// Lists the devices, and what `auto` chooses.
@@ -39,7 +39,7 @@ impl DeviceArgs {
     /// # Errors
     /// As [`device::check`].
     pub fn check(&self) -> Result<()> {
-        device::check(&self.device)
+        device::check(self.name())
     }
 
     /// Opens the device, and says which it is unless it is the CPU that was asked for.
@@ -47,7 +47,12 @@ impl DeviceArgs {
     /// # Errors
     /// As [`device::choose`].
     pub fn open(&self) -> Result<Device> {
-        open(&self.device)
+        open(self.name())
+    }
+
+    /// The name of the device.
+    fn name(&self) -> &str {
+        self.device.as_deref().unwrap_or("cpu")
     }
 }
 

@@ -61,7 +61,7 @@ pub fn frame(args: &FrameArgs, as_json: bool) -> anyhow::Result<()> {
     let png = still.png(&mut *stack.wrap(choice.env()?, goal))?;
     files::write(&args.output, &png)?;
     if as_json {
-        return emit_json(&json!({"file": args.output, "env": choice.id(), "seed": args.seed}));
+        return emit_json(&json!({"file": args.output.to_string_lossy(), "env": choice.id(), "seed": args.seed}));
     }
     emit(&format!("{}\n", args.output.display()));
     Ok(())

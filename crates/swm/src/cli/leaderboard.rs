@@ -4,7 +4,7 @@ use super::eval::run_options;
 use super::progress::control;
 use super::report::results_file;
 use super::results_tables::percent;
-use super::{Context, emit, emit_json, output_folder};
+use super::{Context, as_texts, emit, emit_json, output_folder};
 use crate::home;
 use crate::leaderboard::{
     Class, Entry, How, REWARD_TOLERANCE, Submission, TOLERANCE, Verification, board, entries, verify,
@@ -96,7 +96,9 @@ struct VerifyArgs {
 
 #[derive(Args)]
 struct BuildArgs {
-    /// The folder of the entries: *.json, also in folders below
+    /// The folder of the entries: *.json, also in two levels of folders below
+    ///
+    /// Symbolic links are refused, and entries in deeper folders: no entry is left out.
     folder: PathBuf,
     /// Folder of the pages
     #[arg(short, long, default_value = "site", value_name = "DIR")]
@@ -156,7 +158,8 @@ fn submit(args: &SubmitArgs, context: &Context) -> anyhow::Result<()> {
     };
     entry.write(&args.output)?;
     if context.json {
-        return emit_json(&json!({"path": args.output, "hash": entry.hash, "weights": entry.weights()?}));
+        let path = args.output.to_string_lossy();
+        return emit_json(&json!({"path": path, "hash": entry.hash, "weights": entry.weights()?}));
     }
     emit(&format!("{}\n", args.output.display()));
     Ok(())
@@ -240,11 +243,11 @@ fn build(args: &BuildArgs, context: &Context) -> anyhow::Result<()> {
             json!({"env": table.env, "condition": table.condition, "policies": rates.collect::<Vec<_>>()})
         });
         return emit_json(&json!({
-            "page": page,
+            "page": page.to_string_lossy(),
             "pages": names,
             "tables": tables.collect::<Vec<_>>(),
             "moves": moves,
-            "deleted": deleted,
+            "deleted": as_texts(&deleted),
         }));
     }
     for table in &board.tables {

@@ -51,7 +51,7 @@ mod zoo;
 
 use clap::{FromArgMatches as _, Parser, Subcommand};
 pub use lab::Pages;
-use output::{emit, emit_json, eprint, table};
+use output::{as_texts, emit, emit_json, eprint, table};
 pub use recipes::check_text as check_recipe;
 pub use run_record::{check_training, record_training};
 use std::backtrace::{Backtrace, BacktraceStatus};

@@ -9,6 +9,7 @@ use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::io::{Error, ErrorKind, IsTerminal, Write};
+use std::path::PathBuf;
 use std::sync::{Mutex, OnceLock, PoisonError};
 use swm_core::text::printable;
 
@@ -30,6 +31,11 @@ fn escape() -> &'static str {
 /// Puts the escape characters of tables in their places.
 fn with_escapes(text: &str) -> Cow<'_, str> {
     if text.contains(escape()) { Cow::Owned(text.replace(escape(), "\x1b")) } else { Cow::Borrowed(text) }
+}
+
+/// Paths as texts for [`emit_json`]. A single one is `path.to_string_lossy()`: JSON holds no path that is not UTF-8.
+pub fn as_texts(paths: &[PathBuf]) -> Vec<Cow<'_, str>> {
+    paths.iter().map(|path| path.to_string_lossy()).collect()
 }
 
 /// Prints one JSON document to standard output. JSON has its own escapes for control characters.

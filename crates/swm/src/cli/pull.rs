@@ -1,7 +1,7 @@
 //! `swm pull`: downloads datasets, checkpoints and pretrained weights from the Hugging Face hub; `swm push`: uploads them.
 
 use super::progress::control;
-use super::{Context, emit, emit_json};
+use super::{Context, as_texts, emit, emit_json};
 use crate::home;
 use clap::Args;
 use serde_json::json;
@@ -60,7 +60,7 @@ pub fn pull(args: &PullArgs, context: &Context) -> anyhow::Result<()> {
         args.files.iter().map(|file| fetch(&args.repository, file, &cache)).collect::<Result<_>>()?
     };
     if context.json {
-        return emit_json(&json!({"repository": args.repository, "paths": paths}));
+        return emit_json(&json!({"repository": args.repository, "paths": as_texts(&paths)}));
     }
     for path in paths {
         emit(&format!("{}\n", path.display()));

@@ -73,7 +73,7 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let _lock = output_folder::claim(&args.output, &["index.html"])?;
     let page = swm_report::write_report_with(&read, &options, &args.output)?;
     if as_json {
-        return emit_json(&json!({"report": page}));
+        return emit_json(&json!({"report": page.to_string_lossy()}));
     }
     emit(&format!("{}\n", page.display()));
     Ok(())

@@ -3,6 +3,7 @@
 use super::table;
 use swm_core::Results;
 use swm_core::results::{Comparison, Paired, Proportion, Run};
+use swm_report::number;
 
 /// Returns the tables of some results.
 pub fn summary(results: &Results) -> String {
@@ -31,7 +32,7 @@ fn success(results: &Results) -> Option<String> {
             percent(&run.success),
             run.success.n.to_string(),
             run.solved_at_start.to_string(),
-            run.time_to_goal.map_or("–".to_owned(), |t| format!("{:.0}", t.median)),
+            run.time_to_goal.map_or("–".to_owned(), |t| number(t.median)),
             run.timing
                 .plan_seconds
                 .map_or("–".to_owned(), |t| format!("{} ({})", duration(t.median), duration(t.p95))),
@@ -117,5 +118,24 @@ fn duration(seconds: f64) -> String {
         s if s < 0.01 => format!("{:.2} ms", 1e3 * s),
         s if s < 1.0 => format!("{:.0} ms", 1e3 * s),
         s => format!("{s:.2} s"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use swm_core::results::{Counting, EpisodeResult, Timing};
+
+    #[test]
+    fn medians_are_not_rounded_to_steps() {
+        let solved = |steps| EpisodeResult { success: true, steps, ..EpisodeResult::new(steps as u64) };
+        let run = |steps: &[usize]| {
+            let episodes = steps.iter().copied().map(solved).collect();
+            Run::new("in distribution", "expert", Counting::default(), episodes, Timing::default())
+        };
+        for (steps, median) in [(&[25, 48][..], "36.5"), (&[25, 36, 48], "36")] {
+            let text = summary(&Results { runs: vec![run(steps)], ..Results::default() });
+            assert!(text.split_whitespace().any(|word| word == median), "{steps:?}: {text}");
+        }
     }
 }

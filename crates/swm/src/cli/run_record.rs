@@ -41,6 +41,7 @@ pub struct Invocation {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub program: Option<String>,
     /// The folder in which it ran.
+    #[serde(serialize_with = "files::serialize_path")]
     pub folder: PathBuf,
     /// When it began, in UTC.
     pub started: String,

@@ -1,7 +1,7 @@
 //! `swm completions` and `swm man`: what a shell and `man` need to know about the commands; and the groups in which
 //! `swm --help` lists them.
 
-use super::{Cli, emit, emit_json, output_folder};
+use super::{Cli, as_texts, emit, emit_json, output_folder};
 use clap::{Arg, Args, Command, CommandFactory as _};
 use clap_complete::Shell;
 use clap_mangen::Man;
@@ -87,7 +87,7 @@ pub fn man(args: &ManArgs, as_json: bool) -> anyhow::Result<()> {
         files::write(path, text)?;
     }
     if as_json {
-        return emit_json(&json!({"files": paths}));
+        return emit_json(&json!({"files": as_texts(&paths)}));
     }
     emit(&paths.iter().map(|path| format!("{}\n", path.display())).collect::<String>());
     Ok(())

@@ -5,14 +5,14 @@ use super::pretrained::pretrained_weights;
 use super::progress::{control, print_summary};
 use super::recipes::lines;
 use super::trackers::{Tracker, Trackers};
+use super::train_folder::Record;
 use super::{Context, emit, emit_json, eprint, output, run_record, train_folder};
 use crate::home;
 use clap::Args;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm_core::files::{self, Lock};
-use swm_core::{EnvPool, Error, Origin, Result};
+use swm_core::{EnvPool, Error, Origin, Result, files};
 use swm_data::Reader;
 use swm_models::{
     FAMILIES, FamilyEntry, OnlineRun, StoredCheckpoint, TrainOptions, TrainRun, TrainSummary, TrainableConfig,
@@ -59,7 +59,7 @@ pub struct TrainArgs {
     /// start; with this folder, the next run on the dataset finds them. Several runs may share it.
     #[arg(long, value_name = "FOLDER", conflicts_with = "env")]
     feature_cache: Option<PathBuf>,
-    /// Continue an interrupted run; with --output alone, as it was started
+    /// Continue an interrupted run; without MODEL, as it was started
     #[arg(long)]
     pub(super) resume: bool,
     /// Send metrics to trackers as well, such as wandb,trackio
@@ -118,46 +118,13 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
     if args.resume || StoredCheckpoint::read(&out).is_err() {
         config.check_data(&setup)?;
     }
-    record(&out, args.resume)?;
-    let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt)?;
+    let record = Record::write(&out, args.resume)?;
+    let withdraw = |error: &Error| record.iter().for_each(|record| record.withdraw(error));
+    let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt).inspect_err(withdraw)?;
     let summary = run(&*config, setup, context);
     drop(trackers);
-    let summary = summary.inspect_err(|error| withdraw(&out, args.resume, error))?;
+    let summary = summary.inspect_err(withdraw)?;
     Ok((summary.checkpoint.clone(), json!(summary)))
-}
-
-/// Deletes the record of a new training, and the empty folder, if its settings were refused, or a file such as the cache of features
-/// could not be read or written, before it wrote anything else.
-fn withdraw(out: &Path, resume: bool, error: &Error) {
-    let is_refused = error.is_usage() || matches!(error, Error::Io { .. });
-    let lock = (!resume && is_refused).then(|| Lock::folder(out).ok()).flatten();
-    if lock.is_none() {
-        return;
-    }
-    let is_record = |entry: std::io::Result<std::fs::DirEntry>| entry.is_ok_and(|e| e.file_name() == run_record::FILE);
-    if std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(is_record)) {
-        // The error of the training is the one to report.
-        let _ = files::delete(out, &[run_record::FILE]);
-        let _ = files::remove_empty_folder(out);
-    }
-}
-
-/// Writes the record of a run before its first step, so that the run can be continued from it. A folder that holds another
-/// run keeps its record: the training refuses it.
-///
-/// # Errors
-/// When the folder has links that the training would replace, or PyTorch has finished the run that is to continue.
-fn record(out: &Path, resume: bool) -> Result<()> {
-    train_folder::check_links(out)?;
-    if resume {
-        train_folder::check_unfinished(out, "burn")?;
-    }
-    if !resume && out.join(run_record::FILE).exists() && StoredCheckpoint::read(out).is_ok() {
-        return Ok(());
-    }
-    // Another training that runs in the folder keeps its record as well.
-    let _lock = Lock::folder(out)?;
-    run_record::write(out, resume)
 }
 
 /// Trains online in an environment.
@@ -179,15 +146,16 @@ fn train_online(
         format!("{}-{env}", args.model())
     });
     let out = home::new_checkpoint(&name)?;
-    record(&out, args.resume)?;
-    let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt)?;
+    let record = Record::write(&out, args.resume)?;
+    let withdraw = |error: &Error| record.iter().for_each(|record| record.withdraw(error));
+    let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt).inspect_err(withdraw)?;
     let setup = OnlineRun { environments: &environments, out: &out, options };
     let summary = config.train_online(setup, &mut control(context)).unwrap_or_else(|| {
         let problem = format!("{} trains on datasets only", args.model());
         Err(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"))
     });
     drop(trackers);
-    let summary = summary.inspect_err(|error| withdraw(&out, args.resume, error))?;
+    let summary = summary.inspect_err(withdraw)?;
     let evaluated = summary.evaluated.map_or(String::new(), |mean| format!(", mean return {mean:.1}"));
     let best = summary.best.map_or(String::new(), |(step, mean)| format!(", best {mean:.1} after step {step}"));
     let message = format!(
@@ -205,11 +173,12 @@ fn train_online(
 }
 
 impl TrainArgs {
-    /// Returns the arguments with which the run in the output folder was started, to continue it.
+    /// Returns the arguments with which the run in the output folder was started, to continue it. Dataset, environment,
+    /// encoder and device are those of this command line, if it names them.
     ///
     /// # Errors
-    /// When there is no such run, or its record names what only the user may name: a URI, or an environment that loads
-    /// code.
+    /// When there is no such run, this command line has options that the run cannot follow, or the record of the run names
+    /// what only the user may name: a URI, or an environment that loads code.
     fn started(&self) -> Result<Self> {
         let fix = "name the model and the dataset as well: swm train MODEL --data DATASET --output RUN --resume";
         let Some(output) = &self.output else {
@@ -228,37 +197,95 @@ impl TrainArgs {
         let Some((started, from)) = started.filter(|(started, _)| is_training(started)) else {
             return Err(Error::corrupt(path, "it holds no command line of a training", fix));
         };
-        let origin = Origin::file(&path, false);
-        if let Some(env) = &started.env {
-            crate::env(env, &origin)?;
-        }
+        self.check_options_of(&started, &folder)?;
         // A path that the command line named from another folder.
         let data = started.data.clone().map(|data| match from.join(&data) {
             moved if !Path::new(&data).exists() && moved.exists() => moved.to_string_lossy().into_owned(),
             _ => data,
         });
-        for (kind, name, option) in [("dataset", &data, "--data"), ("encoder", &started.encoder, "--encoder")] {
-            if let Some(name) = name.as_ref().filter(|name| name.contains("://")) {
+        // Printing the configuration opens nothing.
+        if !self.print_config {
+            self.check_names_of(&started, &folder, &Origin::file(&path, false))?;
+            eprint(&format!("continuing: {}\n", output::shorten(record.commands[0].command.join(" "))));
+        }
+        Ok(Self {
+            data: self.data.clone().or(data),
+            env: self.env.clone().or(started.env),
+            max_steps: self.max_steps.or(started.max_steps),
+            encoder: self.encoder.clone().or(started.encoder),
+            device: DeviceArgs { device: self.device.device.clone().or(started.device.device) },
+            output: Some(output.clone()),
+            resume: true,
+            print_config: self.print_config,
+            trust: false,
+            // Only the user may ask for a tracker, which is a program, and name another folder that is written to.
+            log: self.log.clone(),
+            feature_cache: self.feature_cache.clone(),
+            ..started
+        })
+    }
+
+    /// Checks that a run that was started with other arguments can follow the options of this command line.
+    ///
+    /// # Errors
+    /// When one of them has no effect on the run.
+    fn check_options_of(&self, started: &Self, folder: &Path) -> Result<()> {
+        let is_online = started.env.is_some();
+        let trains = if is_online { "trains online in an environment" } else { "trains on a dataset" };
+        let options = [
+            ("--preset", self.preset.is_some(), "keeps its configuration"),
+            ("--data", self.data.is_some() && is_online, trains),
+            ("--feature-cache", self.feature_cache.is_some() && is_online, trains),
+            ("--env", self.env.is_some() && !is_online, trains),
+        ];
+        let refused = options.into_iter().filter(|(_, given, _)| *given).map(|(option, _, reason)| (option, reason));
+        let (refused, mut reasons): (Vec<&str>, Vec<&str>) = refused.unzip();
+        if refused.is_empty() {
+            return Ok(());
+        }
+        reasons.dedup();
+        let problem = format!("the run {} {}", folder.display(), reasons.join(", and "));
+        let fix =
+            "leave this out, or name the model and all settings of the run: swm train MODEL --output RUN --resume …";
+        Err(Error::config(refused.join(", "), problem, fix))
+    }
+
+    /// Checks the names in the recorded arguments of a run that this command line does not replace.
+    ///
+    /// # Errors
+    /// When one is what only the user may name: a URI, an environment that loads code, or weights that may be downloaded.
+    fn check_names_of(&self, started: &Self, folder: &Path, origin: &Origin) -> Result<()> {
+        if let (None, Some(env)) = (&self.env, &started.env) {
+            crate::env(env, origin)?;
+        }
+        let names = [
+            ("dataset", &self.data, &started.data, "--data"),
+            ("encoder", &self.encoder, &started.encoder, "--encoder"),
+        ];
+        for (kind, given, name, option) in names {
+            if let Some(name) = name.as_ref().filter(|name| given.is_none() && name.contains("://")) {
                 origin.check_user(&format!("the {kind} {name}"), "which opens a connection", Some(option))?;
             }
         }
-        if StoredCheckpoint::read(&folder).is_err() {
-            // The run begins, and what is no file would be looked for on the hub of models.
-            for (key, from) in pretrained_weights(&started.config()?.to_json()) {
-                if !Path::new(&from).is_file() {
-                    origin.check_user(
-                        &format!("the pretrained weights '{from}'"),
-                        "which may be downloaded",
-                        Some(&key),
-                    )?;
-                }
+        if StoredCheckpoint::read(folder).is_err() {
+            started.check_weights(origin)?;
+        }
+        Ok(())
+    }
+
+    /// Checks the pretrained weights of a run that begins, whose arguments a file chose: what is no file would be looked for on
+    /// the hub of models.
+    ///
+    /// # Errors
+    /// When the configuration is invalid, or names weights that may be downloaded.
+    fn check_weights(&self, origin: &Origin) -> Result<()> {
+        for (key, from) in pretrained_weights(&self.config()?.to_json()) {
+            if !Path::new(&from).is_file() {
+                let name = format!("the pretrained weights '{from}'");
+                origin.check_user(&name, "which may be downloaded", Some(&key))?;
             }
         }
-        eprint(&format!("continuing: {}\n", output::shorten(record.commands[0].command.join(" "))));
-        let output = Some(output.clone());
-        // Only the user may ask for a tracker, which is a program, and name another folder that is written to.
-        let (log, feature_cache) = (self.log.clone(), self.feature_cache.clone());
-        Ok(Self { data, output, resume: true, print_config: false, trust: false, log, feature_cache, ..started })
+        Ok(())
     }
 
     /// Checks the options against each other and the family. Reads no dataset.

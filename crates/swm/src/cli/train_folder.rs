@@ -1,9 +1,14 @@
 //! Checks of the folder of a training before the work: links that it would write through, and finished runs of another program.
+//! The record of a training there, which goes again if the training is refused.
 
 use super::run_record;
 use serde_json::Value;
+use std::collections::BTreeSet;
+use std::ffi::OsString;
+use std::fs::DirEntry;
 use std::path::Path;
-use swm_core::{Error, Result, files};
+use swm_core::files::{self, Lock};
+use swm_core::{Error, Result};
 use swm_models::StoredCheckpoint;
 use swm_models::run_folder::{FOLDER, NEW_FOLDER, OLD_FOLDER};
 
@@ -13,6 +18,62 @@ const MAX_STATE: u64 = 1 << 24;
 const NAMES: &[&str] = &[FOLDER, NEW_FOLDER, OLD_FOLDER, "best", "world", "train.jsonl", "failed-batch.safetensors"];
 /// The start of the names of folders with the data of an online run.
 const PLAYED: &str = "played-";
+
+/// The record that a training wrote to its folder, with what the folder held before.
+pub struct Record<'a> {
+    run: &'a Path,
+    earlier: Option<Vec<u8>>,
+    content: BTreeSet<(OsString, u64)>,
+}
+
+impl<'a> Record<'a> {
+    /// Writes the record of a run before its first step, so that the run can be continued from it. A folder that holds another
+    /// run keeps its record: the training refuses it.
+    ///
+    /// # Errors
+    /// When the folder has links that the training would replace, PyTorch has finished the run that is to continue, or the record
+    /// cannot be written.
+    pub fn write(run: &'a Path, resume: bool) -> Result<Option<Self>> {
+        check_links(run)?;
+        if resume {
+            check_unfinished(run, "burn")?;
+        }
+        let path = run.join(run_record::FILE);
+        if !resume && path.exists() && StoredCheckpoint::read(run).is_ok() {
+            return Ok(None);
+        }
+        run_record::check(run)?;
+        // Another training that runs in the folder keeps its record as well.
+        let _lock = Lock::folder(run)?;
+        let earlier = files::exists(&path)?.then(|| files::read(&path, MAX_STATE)).transpose()?;
+        let written = run_record::write(run, resume);
+        // The error of the record is the one to report.
+        let _ = written.is_err().then(|| files::remove_empty_folder(run));
+        written?;
+        Ok(Some(Self { run, earlier, content: content(run) }))
+    }
+
+    /// Puts the earlier record back, or deletes the new one and the empty folder, if the training failed before it wrote
+    /// anything, such as one that was refused: it begins or continues a log. An interrupted training keeps its record.
+    pub fn withdraw(&self, error: &Error) {
+        let lock = (!matches!(error, Error::Interrupted)).then(|| Lock::folder(self.run).ok()).flatten();
+        if lock.is_none() || content(self.run) != self.content {
+            return;
+        }
+        // The error of the training is the one to report.
+        let _ = match &self.earlier {
+            Some(text) => files::write(&self.run.join(run_record::FILE), text),
+            None => files::delete(self.run, &[run_record::FILE]).and_then(|_| files::remove_empty_folder(self.run)),
+        };
+    }
+}
+
+/// The names in a folder, with the sizes of the files.
+fn content(folder: &Path) -> BTreeSet<(OsString, u64)> {
+    let size = |entry: &DirEntry| entry.metadata().map_or(0, |metadata| metadata.len());
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.map(|entry| (entry.file_name(), size(&entry))).collect()
+}
 
 /// Checks that nothing that a training writes is a symbolic link. It could not replace a linked folder at its first checkpoint,
 /// or would write to where the link points. The folder of the run itself may be one.

@@ -18,7 +18,7 @@ pub fn zoo(as_json: bool) -> anyhow::Result<()> {
                 Err(error) => json!({"error": error.to_string()}),
             };
             row["name"] = json!(name);
-            row["path"] = json!(path);
+            row["path"] = json!(path.to_string_lossy());
             row
         });
         return emit_json(&rows.collect::<Vec<_>>());

@@ -14,7 +14,7 @@ use swm_report::{BoardEntry, BoardRow, BoardTable, Leaderboard};
 const MAX_ENTRIES: usize = 1000;
 /// The largest size of all entries together, in bytes.
 const MAX_BYTES: u64 = 256 << 20;
-/// The folders below that of the entries which are searched.
+/// The levels of folders that may have entries, with the folder itself.
 const DEPTH: usize = 3;
 /// The characters of a hash in the name of a page.
 const SHORT_HASH: usize = 12;
@@ -28,10 +28,11 @@ pub struct Found {
     pub entry: Entry,
 }
 
-/// Reads all entries of a folder: its files `*.json` and those of its folders, by name. Links are not followed.
+/// Reads all entries of a folder: its files `*.json` and those of its folders, by name. What would be left out is an error: a
+/// symbolic link to an entry or a folder, a pipe or a device with such a name, and an entry too many folders below.
 ///
 /// # Errors
-/// When there is no entry, a file is no valid entry, two entries are equal, or there are too many.
+/// When there is no entry, one would be left out, a file is no valid entry, two entries are equal, or there are too many.
 pub fn entries(folder: &Path) -> Result<Vec<Found>> {
     let mut files = vec![];
     add(folder, DEPTH, &mut files)?;
@@ -65,15 +66,28 @@ pub fn entries(folder: &Path) -> Result<Vec<Found>> {
     Ok(found)
 }
 
+/// Adds the entries of a folder. `depth` is the number of levels of folders that may still have some.
 fn add(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
     let io = |error| Error::io(folder, "listing the entries", error);
     for item in std::fs::read_dir(folder).map_err(io)? {
         let item = item.map_err(io)?;
         // The type of the item itself, not that of the target of a link.
         let (kind, path) = (item.file_type().map_err(io)?, item.path());
-        if kind.is_dir() && depth > 1 {
-            add(&path, depth - 1, files)?;
-        } else if kind.is_file() && path.extension().is_some_and(|end| end == "json") {
+        let is_entry = path.extension().is_some_and(|end| end == "json");
+        let left_out = match kind {
+            _ if kind.is_symlink() && (is_entry || path.is_dir()) => Some("is a symbolic link, which is not followed"),
+            _ if kind.is_dir() || !is_entry => None,
+            _ if !kind.is_file() => Some("is not a regular file"),
+            _ if depth == 0 => Some("is too many folders below that of the entries"),
+            _ => None,
+        };
+        if let Some(problem) = left_out {
+            let fix = "copy the entries into the folder or one directly below, or move this out of it";
+            return Err(Error::config(path.display().to_string(), problem, fix));
+        }
+        if kind.is_dir() {
+            add(&path, depth.saturating_sub(1), files)?;
+        } else if is_entry {
             files.push(path);
         }
         if files.len() > MAX_ENTRIES {

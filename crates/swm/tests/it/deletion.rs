@@ -314,6 +314,8 @@ fn training_does_not_replace_files_of_the_user() {
         user_file(&file);
         swm.fails(&train(&format!("./{}", &place[..1])), 2, &["choose another"]);
         assert_untouched(&file);
+        let record = swm.path(&place[..1]).join("run.json");
+        assert!(!record.exists(), "{place}: a refused training leaves a record, and its folder is no run");
     }
     fs::write(swm.path("a/train.jsonl"), "{\"step\": 1}\n").expect("writing a log of another program");
     swm.fails(&train("./a"), 2, &["train.jsonl", "not written by this program"]);

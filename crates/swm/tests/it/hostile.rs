@@ -223,6 +223,10 @@ fn continuing_a_finished_online_run_leaves_its_replay_data_in_place() {
     let before = (inodes(&data), inodes(&data.join("replay.lance/data")));
     swm.json(&[&train[..], &["--resume"]].concat());
     assert_eq!((inodes(&data), inodes(&data.join("replay.lance/data"))), before);
+    for option in ["--data", "--feature-cache"] {
+        let given = ["train", "-o", "./run", "--resume", option, "rooms"];
+        swm.fails(&given, 2, &[option, "run trains online in an environment"]);
+    }
 }
 
 /// The entries of a folder, with the numbers of their files.

@@ -337,6 +337,39 @@ fn pages_rank_entries_and_run_nothing_of_theirs() {
     swm.fails(&["leaderboard", "build", "site", "-o", "new"], 2, &["0 entries"]);
 }
 
+#[test]
+fn no_entry_is_left_out() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (board, own) = (folder.path().join("board"), Path::new(env!("CARGO_MANIFEST_DIR")).join("../../leaderboard"));
+    let entry = |name: &str| {
+        let path = board.join(name);
+        fs::create_dir_all(path.parent().expect("a folder")).expect("creating a folder");
+        fs::copy(own.join("two-room-lewm.json"), &path).expect("copying an entry");
+        path
+    };
+    let refused = |path: &Path, problem: &str| {
+        let error = entries(&board).expect_err(problem).to_string();
+        assert!(error.contains(problem) && error.contains(&*path.to_string_lossy()), "{error}");
+    };
+    let first = entry("a/b/entry.json");
+    fs::create_dir_all(board.join("1/2/3/4/5")).expect("folders without entries");
+    fs::write(board.join("1/2/3/4/5/notes.txt"), "").expect("writing a file");
+    std::os::unix::fs::symlink("notes.txt", board.join("1/2/3/4/5/link.txt")).expect("making a link");
+    assert_eq!(entries(&board).expect("an entry").len(), 1);
+    let deep = entry("1/2/3/4/entry.json");
+    refused(&deep, "too many folders below");
+    fs::remove_file(&deep).expect("removing the entry");
+    for (target, link) in [(first.clone(), "linked.json"), (own, "linked"), (board.join("nothing"), "broken.json")] {
+        let link = board.join(link);
+        std::os::unix::fs::symlink(target, &link).expect("making a link");
+        refused(&link, "is a symbolic link");
+        fs::remove_file(&link).expect("removing the link");
+    }
+    let socket = board.join("socket.json");
+    let _listener = std::os::unix::net::UnixListener::bind(&socket).expect("making a socket");
+    refused(&socket, "is not a regular file");
+}
+
 /// A sample of every entry of the repository holds; there is one for each capsule of Two-Room.
 #[test]
 fn entries_of_the_repository_hold() {

@@ -64,6 +64,17 @@ fn a_request_to_end_reaches_the_run() {
 }
 
 #[test]
+fn a_signal_that_ends_the_driver_is_named() {
+    let swm = Swm::new();
+    let (child, id) = start(&swm);
+    kill("-KILL", &id);
+    let output = child.wait_with_output().expect("swm ends");
+    let error = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{error}");
+    assert!(error.contains("signal 9 ended") && !error.contains("error above"), "{error}");
+}
+
+#[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "only Linux ends the children of a killed process")]
 fn a_run_ends_with_the_program() {
     let swm = Swm::new();

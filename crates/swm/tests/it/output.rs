@@ -1,7 +1,9 @@
 //! Tests of lost output, of output folders, and of text from files on the terminal (docs/security.md).
 
 use crate::{Swm, text};
+use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::ffi::OsStrExt as _;
 use std::process::{Command, Output, Stdio};
 
 /// Evaluates two short episodes in the folder `found`.
@@ -199,6 +201,67 @@ fn without_a_home_folder_nothing_goes_to_the_current_folder() {
     }
     assert_eq!(fs::read_dir(swm.home()).expect("the folder").count(), 0);
     assert!(run(&[&collect[..], &["./rooms.lance"]].concat()).status.success(), "paths need no home folder");
+}
+
+#[test]
+fn the_home_folder_is_on_this_machine() {
+    let swm = Swm::new();
+    let collect = ["collect", "swm/TwoRoom-v1", "--episodes", "1", "--no-pixels", "-o", "rooms"];
+    let run = |variable: &str, value: &str, args: &[&str]| {
+        swm.command(args).env("HOME", swm.path("user")).env(variable, value).output().expect("swm starts")
+    };
+    for (variable, args) in [("STABLEWM_HOME", &collect[..]), ("SWM_ASSETS", &["assets", "install"])] {
+        let output = run(variable, "s3://bucket/home", args);
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        assert!(error.contains(variable) && error.contains("s3://bucket/home is a URI"), "{error}");
+    }
+    assert_eq!(fs::read_dir(swm.home()).expect("the folder").count(), 0);
+    let output = run("STABLEWM_HOME", "~/worlds", &collect);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    assert!(swm.path("user/worlds/datasets/rooms.lance").exists() && !swm.path("~").exists());
+}
+
+#[test]
+fn paths_that_are_not_utf8_are_printed_as_json() {
+    let swm = Swm::new();
+    let odd = swm.home().join(OsStr::from_bytes(b"n\xffu"));
+    fs::create_dir(&odd).expect("a folder");
+    // The home folder and the current folder have the name as well.
+    let json = |args: &[&str], output: Option<&str>| {
+        let mut command = swm.command(args);
+        command.env("STABLEWM_HOME", &odd).env("SWM_ASSETS", odd.join("assets")).current_dir(&odd);
+        if let Some(name) = output {
+            command.arg("-o").arg(odd.join(name));
+        }
+        let output = command.arg("--json").output().expect("swm starts");
+        let error = text(&output.stderr);
+        assert!(output.status.success() && !error.contains("panicked"), "swm {args:?}: {error}");
+        let value: serde_json::Value = serde_json::from_slice(&output.stdout).expect("a JSON document");
+        value.to_string()
+    };
+    // Lance has no such paths.
+    swm.json(&["collect", "swm/TwoRoom-v1", "--policy", "explore", "--episodes", "10", "--image", "64", "-o", "rooms"]);
+    let rooms = swm.path("datasets/rooms.lance").display().to_string();
+    let settings = ["schedule.steps=4", "data.batch_size=8"];
+    let train = [&["train", "pldm", "--data", &rooms, "-o", "model"], &settings[..]].concat();
+    for (args, output) in [
+        (&train[..], None),
+        (&["train", "-o", "model", "--resume"], None),
+        (&["checkpoints", "show", "model"], None),
+        (&["checkpoints", "pack", "model", "--licence", "MIT", "--author", "Ada"], Some("model.safetensors")),
+        (&["frame", "swm/TwoRoom-v1"], Some("frame.png")),
+        (&["preview", &rooms, "--episodes", "1"], Some("preview")),
+        (&["man"], Some("man")),
+        (&["assets"], None),
+    ] {
+        let printed = json(args, output);
+        assert!(printed.contains("n\u{fffd}u"), "{args:?}: {printed}");
+    }
+    let record = fs::read_to_string(odd.join("checkpoints/model/run.json")).expect("the record of a run");
+    assert!(record.contains("n\u{fffd}u"), "{record}");
+    assert!(json(&["checkpoints", "remove", "model", "--yes"], None).contains("n\u{fffd}u"));
+    json(&["zoo"], None);
 }
 
 #[test]

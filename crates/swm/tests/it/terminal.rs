@@ -25,10 +25,40 @@ fn a_run_continues_from_its_folder_alone() {
     assert!(first["started"].as_str().is_some_and(|date| date.ends_with('Z')) && first["version"].is_string());
     swm.fails(&["train", "--output", "nothing", "--resume"], 2, &["unknown checkpoint 'nothing'"]);
     swm.fails(&["train", "--resume"], 2, &["--output"]);
+    options_of_a_continued_run_are_followed_or_refused(&swm);
     // A record names no connection that the user has not chosen.
     let record = record.to_string().replace("\"rooms\"", "\"s3://bucket/rooms.lance\"");
     std::fs::write(swm.path("checkpoints/model/run.json"), record).expect("writing run.json");
     swm.fails(&["train", "--output", "model", "--resume"], 2, &["s3://bucket/rooms.lance", "--data"]);
+    let config = swm.json(&["train", "--output", "model", "--resume", "--print-config"]);
+    assert_eq!(config["schedule"]["steps"], 4, "printing opens no connection: {config}");
+}
+
+/// Options beside `--output` of a run that is continued without its model.
+fn options_of_a_continued_run_are_followed_or_refused(swm: &Swm) {
+    let before = std::fs::read(swm.path("checkpoints/model/run.json")).expect("reading run.json");
+    let resume = ["train", "--output", "model", "--resume"];
+    let fails = |more: &[&str], code: i32, parts: &[&str]| swm.fails(&[&resume[..], more].concat(), code, parts);
+    fails(&["--data", "nowhere.lance"], 2, &["nowhere.lance"]);
+    fails(&["--device", "abacus:0"], 2, &["unknown device 'abacus'"]);
+    fails(&["--encoder", "nowhere"], 2, &["--encoder", "trains its own encoder"]);
+    let online = ["--preset", "nonsense", "--env", "swm/PendulumControl-v1", "--max-steps", "3"];
+    fails(&online, 2, &["--preset, --env", "keeps its configuration, and trains on a dataset", "swm train MODEL"]);
+    fails(&["--env", "swm/PendulumControl-v1"], 2, &["model trains on a dataset"]);
+    let config = swm.json(&[&resume[..], &["--print-config"]].concat());
+    assert_eq!(config["schedule"]["steps"], 4, "{config}");
+    let after = std::fs::read(swm.path("checkpoints/model/run.json")).expect("reading run.json");
+    assert!(before == after, "a command line that trained nothing is in the record");
+    swm.json(&[&resume[..], &["--data", "rooms", "--device", "cpu"]].concat());
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "other", "--policy", "random", "--episodes", "10", "--image", "64"]);
+    let before = std::fs::read(swm.path("checkpoints/model/run.json")).expect("reading run.json");
+    fails(&["--data", "other"], 2, &["other data"]);
+    let after = std::fs::read(swm.path("checkpoints/model/run.json")).expect("reading run.json");
+    assert!(before == after, "the command line of a refused continuation is in the record");
+    // The same data under another name.
+    std::fs::rename(swm.path("datasets/rooms.lance"), swm.path("datasets/moved.lance")).expect("moving the dataset");
+    fails(&[], 2, &["rooms"]);
+    swm.json(&[&resume[..], &["--data", "moved"]].concat());
 }
 
 #[test]

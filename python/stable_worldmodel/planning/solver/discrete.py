@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from .engine import EngineSolver, single
+from ..._action_spaces import single
+from .engine import EngineSolver
 from .hooks import view
 
 __all__ = ["DiscreteSolver"]

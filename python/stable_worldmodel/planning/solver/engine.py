@@ -14,13 +14,14 @@ import numpy as np
 from gymnasium import spaces
 
 from ... import _engine, _options
+from ..._action_spaces import single
 from ..._forks import fork_lock
 from ..._overrides import engine_part
 from ..adapter import Adapter
 from .callbacks import Callback
 from .hooks import Observer, Watched, view
 
-__all__ = ["EngineSolver", "NotConfigured", "last_step", "single", "summed_costs"]
+__all__ = ["EngineSolver", "NotConfigured", "last_step", "summed_costs"]
 
 
 #: The episode's key and the number of the plan, for each row of the next call of `solve`: see `MPCPolicy`.
@@ -28,9 +29,6 @@ PLANS: ContextVar[list[tuple[int, int]] | None] = ContextVar("PLANS", default=No
 
 #: The scaler between the units of the next call's plans and those of the environment: see `MPCPolicy`.
 ACTION_SCALER: ContextVar[Any] = ContextVar("ACTION_SCALER", default=None)
-
-#: The most options of a choice.
-_MOST_OPTIONS = 1 << 20
 
 #: Held while a call of `solve` takes its number; not by the solvers, because locks cannot be pickled.
 _COUNTING = fork_lock()
@@ -72,7 +70,8 @@ class EngineSolver:
         model = cost if model is None else model
         #: The callbacks, which run after every iteration.
         self.callbacks = list(callbacks or ())
-        self.model, self.batch_size, self.device = model, batch_size, device
+        self.model, self.device = model, device
+        self.batch_size = None if batch_size is None else _options.count("batch_size", batch_size)
         self.seed = _options.count("seed", seed, least=0)
         known = _defaults()[self.id]
         self.settings: dict[str, Any] = {}
@@ -96,6 +95,10 @@ class EngineSolver:
 
     def configure(self, *, action_space: spaces.Space[Any], n_envs: int, config: Any) -> None:
         """See `Solver.configure`."""
+        sizes = {name: getattr(config, name, 1) for name in ("horizon", "action_block", "history_len")}
+        # Only policies read the history, and a config of the user may have none.
+        sizes["history_len"] = sizes["history_len"] or 1
+        _engine.check_plan(*(_options.count(f"config.{name}", size) for name, size in sizes.items()))
         self._action_space, self._n_envs, self._config = action_space, int(n_envs), config
         self._single = None
 
@@ -160,7 +163,8 @@ class EngineSolver:
         Returns:
             A dict with `actions` `(B, horizon, action_dim)`, `costs` (for each environment, the cost of the cheapest
             candidate of the last iteration), `trace` (the record of each search) and, with callbacks, `callbacks`: the
-            history of each callback by its `output_key`. The other keys depend on the solver.
+            history of each callback by its `output_key`, with `_2`, `_3`, … behind it for further callbacks with the same
+            key. The other keys depend on the solver.
         """
         config, space = self._configured(), self._space()
         block, horizon, dim = config.action_block, config.horizon, self._plan_dim
@@ -186,7 +190,7 @@ class EngineSolver:
         observer = self._observer()
         watched: Any = Watched(model, observer) if isinstance(model, Adapter) else None
         given = model if watched is None else watched
-        observer.begin(envs)
+        observer.begin(envs, init)
         plans = PLANS.get()
         PLANS.set(None)
         if plans is not None and len(plans) != envs:
@@ -215,7 +219,7 @@ class EngineSolver:
         result = {"actions": view(actions), "costs": costs.tolist(), "trace": json.loads(trace)}
         result |= self._outputs(result, watched)
         if self.callbacks:
-            result["callbacks"] = {callback.output_key: callback.history for callback in self.callbacks}
+            result["callbacks"] = _histories(self.callbacks)
         return result
 
     def _mode(self, model: Any) -> AbstractContextManager[Any]:
@@ -242,7 +246,9 @@ class EngineSolver:
         sigma, momentum = float(settings.get("sigma", 0.0)), float(settings.get("momentum", 0.0))
         space: Any = self._space()
         limits = (space.low.copy(), space.high.copy()) if isinstance(space, spaces.Box) and self.id == "icem" else None
-        return Observer(self.callbacks, elites, sigma, momentum, limits, fits=self.id != "mppi")
+        fits = self.id not in ("mppi", "predictive_sampling")
+        # Only MPPI has a temperature.
+        return Observer(self.callbacks, elites, sigma, momentum, limits, fits, settings.get("temperature"))
 
     def __getattr__(self, name: str) -> Any:
         if isinstance(getattr(type(self), name, None), property):
@@ -297,31 +303,25 @@ def _plain(name: str, value: Any) -> Any:
     return value
 
 
+def _histories(callbacks: Sequence[Callback]) -> dict[str, list[list[Any]]]:
+    """The history of each callback, by keys that differ."""
+    keys = {callback.output_key for callback in callbacks}
+    found: dict[str, list[list[Any]]] = {}
+    for callback in callbacks:
+        key, number = callback.output_key, 1
+        while key in found or (number > 1 and key in keys):
+            number += 1
+            key = f"{callback.output_key}_{number}"
+        found[key] = callback.history
+    return found
+
+
 def summed_costs(trace: list[dict[str, Any]], samples: int) -> list[list[float]]:
     """The sum of the costs of all candidates of all environments, in every step of a gradient solver."""
     means = np.array([search["mean"] for search in trace], dtype=np.float64)
     # The last entry is the comparison of the final candidates.
     totals: list[float] = (samples * means.sum(0))[:-1].tolist()
     return [totals]
-
-
-def single(space: Any, envs: int) -> Any:
-    """The action space of one environment, given that space or the batched space of `envs` environments.
-
-    A `MultiDiscrete` of `envs` equal sizes is taken as the batched space of a `Discrete`, and a `Box` of whole numbers as that
-    of a `MultiDiscrete`, as Gymnasium defines them.
-    """
-    if isinstance(space, spaces.Box) and len(space.shape) > 1:
-        low, high = space.low[0], space.high[0]
-        if space.dtype.kind in "iu" and (np.subtract(high, low, dtype=np.float64) < _MOST_OPTIONS).all():
-            start = low.astype(np.int64)
-            return spaces.MultiDiscrete(high - start + 1, dtype=space.dtype.type, start=start)
-        return spaces.Box(space.low[0], space.high[0], dtype=space.dtype.type)
-    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim > 1:
-        return spaces.MultiDiscrete(space.nvec[0], start=space.start[0])
-    if isinstance(space, spaces.MultiDiscrete) and len(space.nvec) == envs and (space.nvec == space.nvec[0]).all():
-        return spaces.Discrete(space.nvec[0], start=space.start[0])
-    return space
 
 
 def last_step(value: Any) -> np.ndarray:

@@ -25,7 +25,8 @@ class Observer:
         sigma: The initial standard deviation of sampling solvers.
         momentum: The weight of the previous distribution.
         limits: The bounds of an action, `(low, high)`, which callbacks get as `action_low` and `action_high`.
-        fits: Whether the spread is fitted to the elites; that of MPPI never changes.
+        fits: Whether the spread is fitted to the elites; that of MPPI and predictive sampling never changes.
+        temperature: What divides the costs of the elites before they become weights of the mean; `None` for equal weights.
     """
 
     def __init__(
@@ -36,9 +37,11 @@ class Observer:
         momentum: float,
         limits: tuple[np.ndarray, np.ndarray] | None = None,
         fits: bool = True,
+        temperature: float | None = None,
     ) -> None:
         self.callbacks = list(callbacks)
         self.elites, self.momentum, self._sigma, self._fits = elites, momentum, sigma, fits
+        self._temperature = temperature
         #: The number of options of every choice of a model step, for discrete actions.
         self._options: list[int] | None = None
         self._smoothing, self._initial = 0.0, np.empty(0, np.float32)
@@ -51,9 +54,11 @@ class Observer:
         self._options, self._smoothing, self._initial = options, smoothing, initial
         self._probs = initial
 
-    def begin(self, envs: int) -> None:
-        """Begins a search for this many environments."""
+    def begin(self, envs: int, init: np.ndarray | None = None) -> None:
+        """Begins a search for this many environments, which starts at the actions `init` `(envs, H, dim)`."""
         self._spread, self._probs = self._sigma, self._initial
+        if init is not None and self._options is not None:
+            self._probs = self._guessed(init, self._options)
         for callback in self.callbacks:
             callback.reset()
             callback.start_batch()
@@ -109,25 +114,46 @@ class Observer:
         if self._options is not None:
             shaped = {"topk_candidates": elites, "probs": self._probs, "prev_probs": previous}
             return {**shared, **{name: self._shaped(value) for name, value in shaped.items()}}
-        before, keep = candidates[:, 0], self.momentum
-        mean = keep * before + (1 - keep) * elites.mean(1)
+        # The first candidate is the mean of the distribution.
+        before = candidates[:, 0]
+        mean = self._blended(before, self._average(elites, state["topk_vals"]))
         moments = {"mean": mean, "var": self._spread, "prev_mean": before, "prev_var": previous}
         return {**shared, "topk_candidates": view(elites), **{k: view(v) for k, v in moments.items()}, **self._limits}
 
     def advance(self, candidates: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Fits the spread, or the probabilities, to the elites. Returns the elites and the values before."""
         elites = candidates[np.arange(len(candidates))[:, None], chosen[:, : self.elites]]
-        shape, keep = elites[:, 0].shape, self.momentum
+        shape = elites[:, 0].shape
         if self._options is None:
             previous = np.broadcast_to(np.asarray(self._spread, np.float32), shape).copy()
-            deviation = elites.std(1, ddof=1) if self.elites > 1 else np.zeros(shape, np.float32)
-            self._spread = keep * previous + (1 - keep) * deviation if self._fits else previous
+            self._spread = previous
+            if self._fits:
+                self._spread = self._blended(previous, elites.std(1, ddof=1, dtype=np.float64))
         else:
             previous = np.broadcast_to(self._probs, shape).copy()
             sizes = np.repeat(self._options, self._options).astype(np.float32)
             smoothed = (elites.mean(1) + self._smoothing) / (1 + sizes * self._smoothing)
-            self._probs = (keep * previous + (1 - keep) * smoothed).astype(np.float32)
+            self._probs = self._blended(previous, smoothed)
         return elites, previous
+
+    def _average(self, elites: np.ndarray, costs: np.ndarray) -> np.ndarray:
+        """The mean `(B, H, dim)` of the elites, weighted by their costs `(B, K)` if there is a temperature."""
+        if self._temperature is None:
+            return np.asarray(elites.mean(1, dtype=np.float64))
+        costs = costs.astype(np.float64)
+        weights = np.exp(-(costs - costs[:, :1]) / self._temperature)
+        weighted: np.ndarray = np.einsum("bk,bkhd->bhd", weights / weights.sum(1, keepdims=True), elites)
+        return weighted
+
+    def _blended(self, previous: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+        """The values after an iteration: the momentum is the weight of the previous ones."""
+        return np.asarray(self.momentum * previous + (1 - self.momentum) * fitted, np.float32)
+
+    def _guessed(self, init: np.ndarray, options: list[int]) -> np.ndarray:
+        """The probabilities before a search that starts at `init`: half the guess, for every choice that has one."""
+        sums = np.repeat(np.add.reduceat(init, np.cumsum([0, *options[:-1]]), axis=-1), options, axis=-1)
+        guess = np.divide(init, sums, out=np.broadcast_to(self._initial, init.shape).copy(), where=sums > 0)
+        return np.asarray(0.5 * guess + 0.5 * self._initial)
 
     def _shaped(self, values: np.ndarray) -> Any:
         """Values `(.., dim)` as `(.., choices, options)`, if all choices have equally many options."""

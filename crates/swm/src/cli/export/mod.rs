@@ -76,7 +76,8 @@ pub fn export(args: &ExportArgs, context: &Context) -> anyhow::Result<()> {
     let replaced = unfinished.persist(&args.output);
     replaced.map_err(|error| Error::io(&args.output, "writing the recording", error.error))?;
     if context.json {
-        return emit_json(&json!({"file": args.output, "episodes": episodes.len(), "left_out": left_out}));
+        let file = args.output.to_string_lossy();
+        return emit_json(&json!({"file": file, "episodes": episodes.len(), "left_out": left_out}));
     }
     let file = args.output.display();
     emit(&format!("{} episodes in {file}; `rerun {file}` shows them\n", episodes.len()));

@@ -16,9 +16,9 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io::Write as _;
-use std::os::unix::process::CommandExt as _;
+use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::str::FromStr;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -186,6 +186,12 @@ impl OnRayArgs {
     /// When there is no Python with Ray, the run fails, or the user stops it.
     pub fn submit(&self, request: &Request<'_>, context: &Context) -> anyhow::Result<()> {
         let output = absolute(request.output);
+        let directory = std::env::current_dir().unwrap_or_default();
+        let Some(directory) = directory.to_str() else {
+            let (problem, fix) =
+                ("its path is not UTF-8, and Ray receives it as text", "run the command in another folder");
+            return Err(Error::config(format!("the current folder {}", directory.display()), problem, fix).into());
+        };
         let own = ["--on", "--resources", "--wait", "--run-folder"];
         let replaced: Vec<&str> = own.iter().chain(request.replaced).copied().collect();
         let resources =
@@ -195,7 +201,7 @@ impl OnRayArgs {
             "kind": request.kind,
             "version": env!("CARGO_PKG_VERSION"),
             "arguments": without(&run_record::arguments(), &replaced, &["--json", "--print-request"]),
-            "directory": std::env::current_dir().unwrap_or_default(),
+            "directory": directory,
             "output": output,
             "folder": self.folder(&output),
             "resources": resources,
@@ -233,16 +239,23 @@ impl OnRayArgs {
             }
             std::thread::sleep(LOOK);
         };
-        match status.code() {
-            Some(0) => Ok(()),
-            Some(130) => Err(Error::Interrupted.into()),
-            _ => {
-                let problem = "the run ended with the error above";
-                let fix = "correct its cause and give the same command again: finished cells are kept";
-                Err(Error::config(format!("the run {}", self.folder(&output)), problem, fix).into())
-            }
-        }
+        Ok(outcome(status, told, &self.folder(&output))?)
     }
+}
+
+/// Returns how the run with the records in `folder` ended, from the status of the program that runs the cells. `told` says
+/// whether it was told to end.
+fn outcome(status: ExitStatus, told: bool, folder: &str) -> Result<()> {
+    let problem = match (status.code(), status.signal()) {
+        (Some(0), _) => return Ok(()),
+        (Some(130), _) => return Err(Error::Interrupted),
+        // Python that does not catch Ctrl-C yet ends by its signal.
+        (_, Some(signal)) if told || signal == libc::SIGINT => return Err(Error::Interrupted),
+        (_, Some(signal)) => format!("signal {signal} ended the Python process that runs it"),
+        _ => "the run ended with the error above".to_owned(),
+    };
+    let fix = "correct its cause and give the same command again: finished cells are kept";
+    Err(Error::config(format!("the run {folder}"), problem, fix))
 }
 
 /// Whether a path names anything but an empty folder.
@@ -344,6 +357,17 @@ mod tests {
         for wrong in ["slurm", "ray://", "ray:head", "ray://a b"] {
             assert!(wrong.parse::<Cluster>().is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn ctrl_c_interrupts_a_python_that_does_not_catch_it() {
+        let ended = |signal, told| outcome(ExitStatus::from_raw(signal), told, "run");
+        for (signal, told) in [(libc::SIGINT, false), (libc::SIGINT, true), (libc::SIGTERM, true)] {
+            assert!(matches!(ended(signal, told), Err(Error::Interrupted)), "signal {signal}");
+        }
+        let error = ended(libc::SIGKILL, false).expect_err("a signal").to_string();
+        assert!(error.contains("signal 9 ended"), "{error}");
+        assert!(ended(0, true).is_ok());
     }
 
     #[test]

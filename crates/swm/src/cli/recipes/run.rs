@@ -102,7 +102,8 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     }
     if context.json {
         return emit_json(&json!({
-            "folder": request.output, "report": page, "hashes": compared, "settings": state.settings,
+            "folder": request.output.to_string_lossy(), "report": page.as_ref().map(|page| page.to_string_lossy()),
+            "hashes": compared, "settings": state.settings,
             "processor": state.processor, "recorded_on": recipe.recorded_on,
         }));
     }

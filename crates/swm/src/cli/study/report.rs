@@ -49,7 +49,7 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
         files::write(&output.join(name), text.as_bytes())?;
     }
     if as_json {
-        return emit_json(&json!({"report": path}));
+        return emit_json(&json!({"report": path.to_string_lossy()}));
     }
     emit(&format!("{}\n", path.display()));
     Ok(())

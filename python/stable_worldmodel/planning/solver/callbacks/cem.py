@@ -40,9 +40,9 @@ class MeanShiftRecorder(Callback):
 
 
 class EliteSpreadRecorder(Callback):
-    """Records the standard deviation of the elites, averaged over all elements of a plan."""
+    """Records the standard deviation of the elites, averaged over all elements of a plan; 0 for a single elite."""
 
     def compute(self, **state: Any) -> Any:
         elites = array(state["topk_candidates"])
-        spread = elites.std(1, ddof=1)
+        spread = elites.std(1, ddof=min(1, elites.shape[1] - 1))
         return self._reduce(spread.reshape(len(spread), -1).mean(1))

@@ -26,15 +26,17 @@ class Callback:
     The state of an iteration (torch tensors if torch is installed, else arrays; B environments, S candidates, K elites, H
     steps, A the dimension of a step): `step`; `candidates` `(B, S, H, A)` and `costs` `(B, S)`. Sampling solvers add the
     elites, cheapest first: `topk_vals` `(B, K)`, `topk_inds` `(B, K)`, `topk_candidates` `(B, K, H, A)`, and the moments of
-    the distribution that is fitted to them, `mean` and `var` `(B, H, A)` (a standard deviation), with `prev_mean` and
-    `prev_var`, the moments that the candidates were drawn from. The gradient solvers add `params`, the candidates with
-    their gradient as `grad`, and `gradient`.
+    the distribution after the iteration, `mean` and `var` `(B, H, A)` (a standard deviation, which MPPI and predictive
+    sampling never change), with `prev_mean` and `prev_var`, the moments that the candidates were drawn from. For discrete
+    actions, these are `probs` and `prev_probs`. The gradient solvers add `params`, the candidates with their gradient as
+    `grad`, and `gradient`.
 
     Args:
         reduction: How the values of the environments are joined: `"mean"`, `"sum"`, or `"none"` for a list.
     """
 
-    #: The key of the history in the result of `solve`; the name of the class for `None`.
+    #: The key of the history in the result of `solve`; the name of the class for `None`. A second callback with the same key
+    #: has `_2` behind it.
     name: str | None = None
 
     def __init__(self, reduction: str = "mean") -> None:

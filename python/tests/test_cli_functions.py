@@ -32,9 +32,9 @@ def test_the_home_folder_is_a_folder_on_this_machine(tmp_path, monkeypatch):
     monkeypatch.setenv("STABLEWM_HOME", odd)
     assert swm.utils.home() == odd
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("STABLEWM_HOME", "~/worlds")
-    assert swm.utils.home() == str(tmp_path / "worlds")
-    monkeypatch.setenv("STABLEWM_HOME", "s3://bucket/worlds")
+    monkeypatch.setenv("STABLEWM_HOME", "~/data")
+    assert swm.utils.home() == str(tmp_path / "data")
+    monkeypatch.setenv("STABLEWM_HOME", "s3://bucket/data")
     with pytest.raises(ValueError, match="STABLEWM_HOME.*is a URI"):
         swm.utils.home()
 

@@ -273,8 +273,7 @@ mod tests {
         }
     }
 
-    #[test]
-    fn page_has_the_verdict_all_arms_and_the_strips_of_repaired_starts() {
+    fn autopsy() -> Autopsy {
         let some = Estimate { value: 0.5, low: 0.25, high: 0.75 };
         let [dynamics, distance] = [Ingredient::Dynamics, Ingredient::Distance];
         let arm = |ingredients: &[Ingredient]| Arm {
@@ -284,7 +283,7 @@ mod tests {
             harmed: Estimate::default(),
         };
         let contribution = |ingredient| Contribution { ingredient, recovered: some, alone: some, first: 0.97 };
-        let found = Autopsy {
+        Autopsy {
             starts: 30,
             selection: Proportion::wilson(12, 30),
             planning_seeds: 3,
@@ -296,8 +295,12 @@ mod tests {
                 Repair { start: 6, row: None, sets: vec![vec![]] },
                 Repair { start: 9, row: None, sets: vec![] },
             ],
-        };
-        let strip = |start| FrameStrip { start, set: "D".to_owned(), png: vec![1, 2, 3] };
+        }
+    }
+
+    #[test]
+    fn rates_of_no_starts_are_not_shown() {
+        let found = autopsy();
         let harmed = |starts| {
             let mut html = String::new();
             arms(&mut html, &Autopsy { starts, ..found.clone() }).expect("the arms");
@@ -310,10 +313,15 @@ mod tests {
             html.matches("data-label=\"Ranks first\">–<").count()
         };
         assert_eq!([first(found.repairs.clone()), first(vec![])], [0, 2], "nothing ranks first without failures");
+    }
+
+    #[test]
+    fn page_has_the_verdict_all_arms_and_the_strips_of_repaired_starts() {
+        let strip = |start| FrameStrip { start, set: "D".to_owned(), png: vec![1, 2, 3] };
         let page = AutopsyPage {
             title: "Autopsy of <b>x</b>".to_owned(),
             env: "swm/TwoRoom-v1".to_owned(),
-            found,
+            found: autopsy(),
             probes: Some(probes()),
             strips: vec![strip(4), strip(5)],
             command: "swm autopsy x -o y".to_owned(),

@@ -217,9 +217,9 @@ fn the_home_folder_is_on_this_machine() {
         assert!(error.contains(variable) && error.contains("s3://bucket/home is a URI"), "{error}");
     }
     assert_eq!(fs::read_dir(swm.home()).expect("the folder").count(), 0);
-    let output = run("STABLEWM_HOME", "~/worlds", &collect);
+    let output = run("STABLEWM_HOME", "~/data", &collect);
     assert!(output.status.success(), "{}", text(&output.stderr));
-    assert!(swm.path("user/worlds/datasets/rooms.lance").exists() && !swm.path("~").exists());
+    assert!(swm.path("user/data/datasets/rooms.lance").exists() && !swm.path("~").exists());
 }
 
 #[test]

@@ -235,6 +235,18 @@ def test_callbacks_get_the_probabilities_of_the_solver(alpha, init):
     assert torch.equal(found["probs"][0], flat[-1])
 
 
+@pytest.mark.parametrize(
+    ("solver", "recorder", "missing"),
+    [
+        (planning.CEMSolver, hooks.ActionNormRecorder, "params"),
+        (planning.GradientSolver, hooks.EliteCostRecorder, "topk_vals"),
+    ],
+)
+def test_recorders_of_another_solver_are_named(solver, recorder, missing):
+    with pytest.raises(ValueError, match=f"{recorder.__name__}: reads '{missing}', which the state of this solver"):
+        configured(solver(ToTarget(), callbacks=[recorder()], num_samples=16)).solve(infos())
+
+
 def test_a_single_elite_has_no_spread():
     for solver, settings in ((planning.MPPISolver, {"topk": 1, "n_steps": 2}), (planning.PredictiveSamplingSolver, {})):
         found = configured(solver(ToTarget(), callbacks=[hooks.EliteSpreadRecorder()], **settings)).solve(infos())

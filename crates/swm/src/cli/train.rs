@@ -198,18 +198,25 @@ impl TrainArgs {
             return Err(Error::corrupt(path, "it holds no command line of a training", fix));
         };
         self.check_options_of(&started, &folder)?;
-        // A path that the command line named from another folder.
-        let data = started.data.clone().map(|data| match from.join(&data) {
-            moved if !Path::new(&data).exists() && moved.exists() => moved.to_string_lossy().into_owned(),
-            _ => data,
+        // Replaced paths are not looked for.
+        let recorded = |option, given: &Option<String>, path: &Option<String>| {
+            let path = path.as_ref().filter(|_| given.is_none());
+            path.map(|path| path_of_record(option, path, from)).transpose()
+        };
+        let data = recorded("--data", &self.data, &started.data)?;
+        let encoder = recorded("--encoder", &self.encoder, &started.encoder)?;
+        let preset = started.preset.as_ref().map(|preset| match is_preset_file(preset) {
+            true => path_of_record("--preset", preset, from),
+            false => Ok(preset.clone()),
         });
+        let started = Self { data, encoder, preset: preset.transpose()?, ..started };
         // Printing the configuration opens nothing.
         if !self.print_config {
-            self.check_names_of(&started, &folder, &Origin::file(&path, false))?;
+            self.check_names_of(&started, (&folder, from), &Origin::file(&path, false))?;
             eprint(&format!("continuing: {}\n", output::shorten(record.commands[0].command.join(" "))));
         }
         Ok(Self {
-            data: self.data.clone().or(data),
+            data: self.data.clone().or(started.data),
             env: self.env.clone().or(started.env),
             max_steps: self.max_steps.or(started.max_steps),
             encoder: self.encoder.clone().or(started.encoder),
@@ -254,7 +261,7 @@ impl TrainArgs {
     ///
     /// # Errors
     /// When one is what only the user may name: a URI, an environment that loads code, or weights that may be downloaded.
-    fn check_names_of(&self, started: &Self, folder: &Path, origin: &Origin) -> Result<()> {
+    fn check_names_of(&self, started: &Self, (run, from): (&Path, &Path), origin: &Origin) -> Result<()> {
         if let (None, Some(env)) = (&self.env, &started.env) {
             crate::env(env, origin)?;
         }
@@ -267,21 +274,26 @@ impl TrainArgs {
                 origin.check_user(&format!("the {kind} {name}"), "which opens a connection", Some(option))?;
             }
         }
-        if StoredCheckpoint::read(folder).is_err() {
-            started.check_weights(origin)?;
+        if StoredCheckpoint::read(run).is_err() {
+            started.check_weights(from, origin)?;
         }
         Ok(())
     }
 
-    /// Checks the pretrained weights of a run that begins, whose arguments a file chose: what is no file would be looked for on
-    /// the hub of models.
+    /// Checks the pretrained weights of a run that begins, whose arguments a file chose, in the folder `from`: what is no file would
+    /// be looked for on the hub of models.
     ///
     /// # Errors
-    /// When the configuration is invalid, or names weights that may be downloaded.
-    fn check_weights(&self, origin: &Origin) -> Result<()> {
-        for (key, from) in pretrained_weights(&self.config()?.to_json()) {
-            if !Path::new(&from).is_file() {
-                let name = format!("the pretrained weights '{from}'");
+    /// When the configuration is invalid, or names weights that may be downloaded or are another file in the current folder.
+    fn check_weights(&self, from: &Path, origin: &Origin) -> Result<()> {
+        for (key, weights) in pretrained_weights(&self.config()?.to_json()) {
+            let name = format!("the pretrained weights '{weights}'");
+            let path = Path::new(&weights);
+            if path.is_relative() && !is_current(from) && (path.is_file() || from.join(path).is_file()) {
+                let fix = format!("continue the run there: cd {}", from.display());
+                return Err(Error::config(name, "are a path in the folder in which the run was started", fix));
+            }
+            if !path.is_file() {
                 origin.check_user(&name, "which may be downloaded", Some(&key))?;
             }
         }
@@ -352,9 +364,37 @@ impl TrainArgs {
 /// The largest file of a preset that is read.
 const MAX_PRESET: u64 = 1 << 24;
 
+/// Whether a preset is the path of a file, and not a name.
+fn is_preset_file(preset: &str) -> bool {
+    Path::new(preset).extension().is_some_and(|end| end == "toml")
+}
+
+/// Returns a path in the recorded arguments of a run that was started in the folder `from`, as this command finds it in its own
+/// folder. Names and URIs mean the same everywhere.
+///
+/// # Errors
+/// When the path is not there any more, and this folder has one of the same name, which may be another.
+fn path_of_record(option: &str, given: &str, from: &Path) -> Result<String> {
+    let there = from.join(given);
+    if is_current(from) || !(there.exists() || Path::new(given).exists()) {
+        return Ok(given.to_owned());
+    }
+    if !there.exists() {
+        let problem = format!("the run was started in {}, where it is not any more", from.display());
+        let fix = "put it back, or name the model and all settings of the run: swm train MODEL --output RUN --resume …";
+        return Err(Error::config(format!("{option} {given}"), problem, fix));
+    }
+    Ok(there.to_string_lossy().into_owned())
+}
+
+/// Whether this is the current folder.
+fn is_current(folder: &Path) -> bool {
+    std::env::current_dir().and_then(|current| Ok(current.canonicalize()? == folder.canonicalize()?)).unwrap_or(false)
+}
+
 /// Checks that a preset that is a file is TOML; the error names the file and the line.
 fn check_preset_file(preset: &str) -> Result<()> {
-    if Path::new(preset).extension().is_none_or(|end| end != "toml") {
+    if !is_preset_file(preset) {
         return Ok(());
     }
     let text = String::from_utf8_lossy(&files::read(Path::new(preset), MAX_PRESET)?).into_owned();

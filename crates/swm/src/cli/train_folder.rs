@@ -22,6 +22,8 @@ const PLAYED: &str = "played-";
 /// The record that a training wrote to its folder, with what the folder held before.
 pub struct Record<'a> {
     run: &'a Path,
+    /// Keeps other trainings away while this one has not locked the folder yet, or no more.
+    _lock: Lock,
     earlier: Option<Vec<u8>>,
     content: BTreeSet<(OsString, u64)>,
 }
@@ -43,14 +45,15 @@ impl<'a> Record<'a> {
             return Ok(None);
         }
         run_record::check(run)?;
-        // Another training that runs in the folder keeps its record as well.
-        let _lock = Lock::folder(run)?;
+        // Another training that runs in the folder keeps its record as well, and so does one that prepares its data.
+        let _folder = Lock::folder(run)?;
+        drop(path.exists().then(|| Lock::file(&path)).transpose()?);
         let earlier = files::exists(&path)?.then(|| files::read(&path, MAX_STATE)).transpose()?;
         let written = run_record::write(run, resume);
         // The error of the record is the one to report.
         let _ = written.is_err().then(|| files::remove_empty_folder(run));
         written?;
-        Ok(Some(Self { run, earlier, content: content(run) }))
+        Ok(Some(Self { run, _lock: Lock::file(&path)?, earlier, content: content(run) }))
     }
 
     /// Puts the earlier record back, or deletes the new one and the empty folder, if the training failed before it wrote

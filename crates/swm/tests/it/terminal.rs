@@ -62,6 +62,53 @@ fn options_of_a_continued_run_are_followed_or_refused(swm: &Swm) {
 }
 
 #[test]
+fn a_run_continues_with_the_files_of_the_folder_where_it_was_started() {
+    let swm = Swm::new();
+    let run_in = |folder: &str, args: &[&str]| {
+        std::fs::create_dir_all(swm.path(folder)).expect("making a folder");
+        swm.command(args).current_dir(swm.path(folder)).output().expect("swm runs")
+    };
+    for (folder, seed) in [("a", "1"), ("b", "2")] {
+        let collect = ["collect", "swm/TwoRoom-v1", "-o", "d.lance", "--policy", "explore", "--episodes", "10"];
+        assert!(run_in(folder, &[&collect[..], &["--image", "64", "--seed", seed]].concat()).status.success());
+        let settings = ["schedule.steps=4", "data.batch_size=8", &format!("seed={seed}")];
+        let print = ["train", "pldm", "--data", "./d.lance", "--print-config"];
+        let preset = run_in(folder, &[&print[..], &settings].concat());
+        std::fs::write(swm.path(folder).join("p.toml"), preset.stdout).expect("writing a preset");
+    }
+    let start = ["train", "pldm", "--data", "d.lance", "--preset", "p.toml", "-o", "../run"];
+    let started = run_in("a", &start);
+    assert!(started.status.success(), "{}", text(&started.stderr));
+    let manifest = || std::fs::read_to_string(swm.path("run/checkpoint/manifest.json")).expect("reading the manifest");
+    let first = manifest();
+    // As if it had been killed before its first checkpoint.
+    let begin_again = || {
+        std::fs::remove_dir_all(swm.path("run/checkpoint")).expect("removing the checkpoint");
+        std::fs::remove_file(swm.path("run/train.jsonl")).expect("removing the log");
+    };
+    begin_again();
+    let resume = ["train", "-o", "../run", "--resume"];
+    let resumed = run_in("b", &resume);
+    assert!(resumed.status.success() && manifest() == first, "{}", text(&resumed.stderr));
+    begin_again();
+    // A training that prepares its data keeps others away.
+    let record = || std::fs::read(swm.path("run/run.json")).expect("reading run.json");
+    let before = record();
+    let lock = swm_core::files::Lock::file(&swm.path("run/run.json")).expect("locking run.json");
+    let refused = run_in("a", &start);
+    assert!(text(&refused.stderr).contains("another process writes to it"), "{}", text(&refused.stderr));
+    drop(lock);
+    for (name, option) in [("p.toml", "--preset p.toml"), ("d.lance", "--data d.lance")] {
+        std::fs::rename(swm.path("a").join(name), swm.path("a/moved")).expect("moving a file");
+        let refused = run_in("b", &resume);
+        let error = text(&refused.stderr);
+        assert!(!refused.status.success() && error.contains(option) && error.contains("not any more"), "{error}");
+        std::fs::rename(swm.path("a/moved"), swm.path("a").join(name)).expect("moving a file");
+    }
+    assert!(record() == before, "a command line that trained nothing is in the record");
+}
+
+#[test]
 fn curves_are_drawn_and_written() {
     let swm = Swm::new();
     trained(&swm);

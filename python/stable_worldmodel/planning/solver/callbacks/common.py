@@ -13,6 +13,13 @@ class StopSearch(Exception):
     """Raised by a callback to end the search after this iteration: the plan is the one of the iterations so far."""
 
 
+#: The parts of the state that some solvers have.
+_OF_SOME_SOLVERS = frozenset(
+    ("topk_vals", "topk_inds", "topk_candidates", "mean", "var", "prev_mean", "prev_var", "probs", "prev_probs")
+    + ("action_low", "action_high", "params", "gradient")
+)
+
+
 class Callback:
     """Runs after every iteration of a search; `history` holds what `compute` returned, for each batch and iteration.
 
@@ -58,8 +65,19 @@ class Callback:
         raise NotImplementedError(f"{type(self).__name__} has no compute(**state)")
 
     def __call__(self, **state: Any) -> None:
-        """Records the value of an iteration."""
-        value = self.compute(**state)
+        """Records the value of an iteration.
+
+        Raises:
+            ValueError: If `compute` reads a part of the state that this solver does not have.
+        """
+        try:
+            value = self.compute(**state)
+        except KeyError as error:
+            missing = next(iter(error.args), None)
+            if missing not in _OF_SOME_SOLVERS or missing in state:
+                raise
+            problem = f"reads {missing!r}, which the state of this solver does not have"
+            raise ValueError(f"{type(self).__name__}: {problem}; it has {', '.join(sorted(state))}") from error
         if value is not None:
             self.values.append(value)
 

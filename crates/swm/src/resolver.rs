@@ -64,8 +64,8 @@ struct Wrapping {
 /// The checkpoint, the dataset and the columns of a probe.
 type ProbeKey = (String, String, Vec<String>);
 
-/// Plans, each with the name of its policy.
-type Traces = Arc<Mutex<Vec<(String, PlanRecord)>>>;
+/// The plans of each run, with the name of its policy.
+type Traces = Arc<Mutex<Vec<(String, Vec<PlanRecord>)>>>;
 
 impl HomeResolver {
     /// Creates a resolver of requests whose names `origin` chose.
@@ -116,8 +116,8 @@ impl HomeResolver {
         crate::env(id, origin)
     }
 
-    /// Returns the plans since the last call, in order, each with the name of its policy.
-    pub fn take_traces(&self) -> Vec<(String, PlanRecord)> {
+    /// Returns the plans of every run since the last call, in order, with the names of their policies.
+    pub fn take_traces(&self) -> Vec<(String, Vec<PlanRecord>)> {
         let Some(traces) = &self.traces else { return vec![] };
         std::mem::take(&mut *traces.lock().unwrap_or_else(PoisonError::into_inner))
     }
@@ -265,8 +265,7 @@ impl HomeResolver {
         let searches = move || {
             let records = log.take();
             let searches = records.iter().map(|record| record.search.clone()).collect();
-            let named = records.into_iter().map(|record| (name.clone(), record));
-            traces.lock().unwrap_or_else(PoisonError::into_inner).extend(named);
+            traces.lock().unwrap_or_else(PoisonError::into_inner).push((name.clone(), records));
             searches
         };
         ResolvedPolicy { searches: Some(Box::new(searches)), ..ResolvedPolicy::from(policy) }

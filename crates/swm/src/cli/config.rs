@@ -108,17 +108,7 @@ impl VariationArgs {
     pub fn request(&self) -> Result<VariationRequest> {
         let mut variation_values = BTreeMap::new();
         for pin in &self.pin {
-            let wrong = || {
-                Error::config(
-                    format!("--pin {pin}"),
-                    "it is not KEY=NUMBER[,NUMBER…]",
-                    "write it like background.color=200,220,255",
-                )
-            };
-            let (key, values) = pin.split_once('=').ok_or_else(wrong)?;
-            let parse = |value: &str| value.trim().parse().ok().filter(|value: &f64| value.is_finite());
-            let values: Option<Vec<f64>> = values.split(',').map(parse).collect();
-            let values = values.ok_or_else(wrong)?;
+            let (key, values) = pinned("--pin", pin)?;
             if variation_values.insert(key.to_owned(), values).is_some() {
                 let is_first = |other: &&String| other.split_once('=').is_some_and(|(other, _)| other == key);
                 let first = self.pin.iter().find(is_first).unwrap_or(pin);
@@ -134,16 +124,20 @@ impl VariationArgs {
 
     /// Returns these factors and one more: `KEY=VALUE` to set it, `KEY` to sample it. `by_default` are the factors that are
     /// sampled where none are given.
-    pub fn with(&self, shift: &str, by_default: &[String]) -> Self {
+    ///
+    /// # Errors
+    /// When the value is not numbers.
+    pub fn with(&self, shift: &str, by_default: &[String]) -> Result<Self> {
         let mut all = self.clone();
         if shift.contains('=') {
+            pinned("--shift", shift)?;
             all.pin.push(shift.to_owned());
         } else {
             let keys = all.variation.get_or_insert_with(|| by_default.to_vec());
             keys.retain(|key| key != "none");
             keys.push(shift.to_owned());
         }
-        all
+        Ok(all)
     }
 
     /// Returns a short description of the shift.
@@ -152,6 +146,22 @@ impl VariationArgs {
         let shifts: Vec<String> = varied.chain(self.pin.iter().cloned()).collect();
         if shifts.is_empty() { "in distribution".to_owned() } else { shifts.join(", ") }
     }
+}
+
+/// Parses the key and the values of a pinned factor, which an option gives.
+///
+/// # Errors
+/// When it is not `KEY=NUMBER[,NUMBER…]` with finite numbers.
+fn pinned<'a>(option: &str, given: &'a str) -> Result<(&'a str, Vec<f64>)> {
+    let parse = |value: &str| value.trim().parse().ok().filter(|value: &f64| value.is_finite());
+    let found = given.split_once('=').and_then(|(key, values)| {
+        let values: Option<Vec<f64>> = values.split(',').map(parse).collect();
+        Some((key, values?))
+    });
+    found.ok_or_else(|| {
+        let fix = "write it like background.color=200,220,255";
+        Error::config(format!("{option} {given}"), "it is not KEY=NUMBER[,NUMBER…]", fix)
+    })
 }
 
 /// Parses a count from `LOW` to `HIGH`. An absurd count would otherwise take all memory before any check.

@@ -16,7 +16,7 @@ use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm_core::limits::{ENVS, EVALUATED_EPISODES, STEPS};
-use swm_core::results::{Counting, Until};
+use swm_core::results::{Counting, Run, Until};
 use swm_core::{EnvChoice, Error, Key, Origin, Result, Results, files};
 use swm_data::{Part, Split};
 use swm_eval::{Condition, EvalRequest, HeldOut, Model, PolicyKind, PolicyRequest, RunOptions, StartsRequest, publish};
@@ -187,8 +187,8 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     {
         eprint(&format!("warning: {warning}\n"));
     }
-    // Before the work: only a traced evaluation replaces the traces.
-    if args.trace {
+    // Before the work, which replaces older traces with those of these plans.
+    if args.trace && args.output.exists() {
         drop(output_folder::claim(&args.output, &[TRACES])?);
     }
     let output = (args.output.as_path(), args.video_count());
@@ -197,14 +197,14 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     }
     let (results, file) = run(&request, &resolver, args.envs, output, context)?;
     if args.trace {
-        write_traces(&args.output, &resolver)?;
+        write_traces(&args.output, &resolver, &results)?;
     }
     Ok((results, file))
 }
 
-/// Writes the plans that a resolver has traced.
-pub(super) fn write_traces(output: &Path, resolver: &HomeResolver) -> Result<()> {
-    write_json(&output.join(TRACES), &traces(resolver))
+/// Writes the plans that a resolver has traced in an evaluation with these results.
+pub(super) fn write_traces(output: &Path, resolver: &HomeResolver, results: &Results) -> Result<()> {
+    write_json(&output.join(TRACES), &traces(resolver, results))
 }
 
 impl EvalArgs {
@@ -344,8 +344,8 @@ impl EvalArgs {
         let each = space.factors().iter().map(|factor| &factor.key).filter(|key| !by_default.contains(key));
         let each: Vec<&String> = if self.each_factor { each.collect() } else { vec![] };
         for shift in self.shift.iter().chain(each) {
-            let named = self.variation.with(shift, &[]);
-            conditions.push(condition(&named, &self.variation.with(shift, by_default))?);
+            let named = self.variation.with(shift, &[])?;
+            conditions.push(condition(&named, &self.variation.with(shift, by_default)?)?);
         }
         Ok(conditions)
     }
@@ -380,6 +380,7 @@ pub fn run(
     let results = results?;
     let file = output.join(output_folder::RESULTS);
     publish(output, results.runs.iter().flat_map(|run| &run.videos))?;
+    output_folder::delete_traces(output)?;
     write_json(&file, &results)?;
     run_record::write(output, false)?;
     Ok((results, file))
@@ -397,12 +398,20 @@ pub fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
     files::write(file, (text + "\n").as_bytes())
 }
 
-/// Returns every traced plan as one object.
-fn traces(resolver: &HomeResolver) -> Vec<Value> {
-    let plans = resolver.take_traces().into_iter().map(|(policy, record)| {
-        let mut plan = json!(record);
-        plan["policy"] = json!(policy);
-        plan
-    });
-    plans.collect()
+/// Returns every traced plan as one object, by run, episode and number.
+fn traces(resolver: &HomeResolver, results: &Results) -> Vec<Value> {
+    let mut runs: Vec<&Run> = results.runs.iter().collect();
+    let mut plans = vec![];
+    for (policy, mut records) in resolver.take_traces() {
+        // The runs of a policy, and so their plans, are in the order of the conditions.
+        let run = runs.iter().position(|run| run.policy == policy).map(|next| runs.remove(next));
+        records.sort_by_key(|record| (record.episode, record.replan));
+        plans.extend(records.into_iter().map(|record| {
+            let mut plan = json!(record);
+            plan["policy"] = json!(policy);
+            plan["condition"] = json!(run.map(|run| &run.condition));
+            plan
+        }));
+    }
+    plans
 }

@@ -29,6 +29,9 @@ pub fn run(
     // Continuing adds a command line to the record, once there are results.
     let mut is_recorded = false;
     let mut keep = |results: &Results| {
+        if !is_recorded {
+            output_folder::delete_traces(output)?;
+        }
         write_json(&file, results)?;
         if !std::mem::replace(&mut is_recorded, true) {
             run_record::write(output, resume)?;

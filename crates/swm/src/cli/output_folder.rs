@@ -72,6 +72,18 @@ fn delete_temporary_of_evaluation(folder: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Deletes the traces of an earlier evaluation, before the results of another one are written beside them.
+///
+/// # Errors
+/// When they cannot be deleted.
+pub fn delete_traces(folder: &Path) -> Result<()> {
+    let path = folder.join(TRACES);
+    if files::exists(&path)? && is_own(&path) {
+        files::delete(folder, &[TRACES])?;
+    }
+    Ok(())
+}
+
 /// Returns a file in the folder of an evaluation that no evaluation writes, if there is one.
 ///
 /// # Errors

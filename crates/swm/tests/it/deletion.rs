@@ -170,6 +170,47 @@ fn traces_do_not_replace_files_of_the_user() {
         swm.json(&traced);
         assert!(fs::read_to_string(&file).expect("reading the traces").contains("\"simulator\""));
     }
+    // Those of other plans do not stay beside new results.
+    swm.json(&eval);
+    assert!(!file.exists());
+    let new = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "1", "--trace", "-o", "new"];
+    for shift in ["agent.speed=abc", "agent.speed=1e9"] {
+        swm.fails(&[&new[..], &["--shift", shift]].concat(), 2, &["agent.speed"]);
+    }
+    swm.fails(&[&new[..], &["--shift", "agent.speed=abc"]].concat(), 2, &["--shift agent.speed=abc"]);
+    assert!(!swm.path("new").exists());
+}
+
+#[test]
+fn traces_name_the_conditions_of_their_plans() {
+    let swm = Swm::new();
+    let eval = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "3", "--budget", "5", "--trace"];
+    let plan = ["--solver", "cem,samples=16,iterations=2,elites=4", "--shift", "agent.speed"];
+    let plans = |envs: &str| {
+        swm.json(&[&eval[..], &plan, &["--envs", envs, "-o", "found"]].concat());
+        let text = fs::read(swm.path("found/traces.json")).expect("reading the traces");
+        let plans: Vec<serde_json::Value> = serde_json::from_slice(&text).expect("a list");
+        let key = |plan: &serde_json::Value| {
+            ["condition", "policy", "episode", "replan", "cost"].map(|name| plan[name].to_string())
+        };
+        plans.iter().map(key).collect::<Vec<_>>()
+    };
+    let one = plans("1");
+    assert_eq!(one, plans("3"));
+    let results = fs::read(swm.path("found/results.json")).expect("reading the results");
+    let results: serde_json::Value = serde_json::from_slice(&results).expect("results");
+    let mut conditions: Vec<&str> = one.iter().map(|plan| &*plan[0]).collect();
+    conditions.dedup();
+    let named: Vec<String> =
+        results["runs"].as_array().expect("runs").iter().map(|run| run["condition"].to_string()).collect();
+    assert!(
+        conditions.len() == 2 && conditions.iter().all(|name| named.contains(&(*name).to_owned())),
+        "{conditions:?}"
+    );
+    let mut keys: Vec<_> = one.iter().map(|plan| &plan[..4]).collect();
+    keys.sort();
+    keys.dedup();
+    assert_eq!(keys.len(), one.len(), "every plan has its own condition, policy, episode and number");
 }
 
 #[test]

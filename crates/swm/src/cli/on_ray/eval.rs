@@ -86,7 +86,7 @@ impl EvalCommand {
         let Some(episodes) = self.stage else {
             let (results, _) = eval::run(part, resolver, args.envs, (&args.output, videos), context)?;
             if args.trace {
-                write_traces(&args.output, resolver)?;
+                write_traces(&args.output, resolver, &results)?;
             }
             return Ok(results);
         };
@@ -116,6 +116,7 @@ impl EvalCommand {
         };
         let _lock = output_folder::claim(&args.output, &[RESULTS, TRACES])?;
         copy_videos(parts, conditions, &args.output)?;
+        output_folder::delete_traces(&args.output)?;
         if args.trace {
             write_json(&args.output.join(TRACES), &joined_traces(parts, conditions)?)?;
         }

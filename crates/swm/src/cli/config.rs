@@ -237,12 +237,12 @@ mod tests {
         let wrong = VariationArgs { variation: None, pin: vec!["background.color".to_owned()] };
         assert!(wrong.request().expect_err("a pin without a value").to_string().contains("background.color=200"));
         let keys = ["agent.position".to_owned()];
-        let all = VariationArgs::default().with("block", &keys).variation;
+        let all = VariationArgs::default().with("block", &keys).expect("a shift").variation;
         assert_eq!(all, Some(vec!["agent.position".to_owned(), "block".to_owned()]));
         let none = VariationArgs { variation: Some(vec!["none".to_owned()]), pin: vec![] };
-        assert_eq!(none.with("agent", &keys).variation, Some(vec!["agent".to_owned()]));
+        assert_eq!(none.with("agent", &keys).expect("a shift").variation, Some(vec!["agent".to_owned()]));
         assert_eq!(
-            args.with("agent.scale=3", &keys).with("block", &keys).describe(),
+            args.with("agent.scale=3", &keys).expect("a shift").with("block", &keys).expect("a shift").describe(),
             "agent sampled, block sampled, background.color=1, 2,3, agent.scale=3"
         );
         assert_eq!(image_size("64x96"), Ok((64, 96)));

@@ -244,7 +244,7 @@ def test_callbacks_get_the_probabilities_of_the_solver(alpha, init):
 )
 def test_recorders_of_another_solver_are_named(solver, recorder, missing):
     with pytest.raises(ValueError, match=f"{recorder.__name__}: reads '{missing}', which the state of this solver"):
-        configured(solver(ToTarget(), callbacks=[recorder()], num_samples=16)).solve(infos())
+        configured(solver(ToTarget(), callbacks=[recorder()], num_samples=64)).solve(infos())
 
 
 def test_a_single_elite_has_no_spread():

@@ -28,7 +28,7 @@ def single(space: Any, envs: int) -> Any:
     """The action space of one environment, given that space or the batched space of `envs` environments.
 
     A `MultiDiscrete` of `envs` equal sizes is taken as the batched space of a `Discrete`, and a `Box` of whole numbers as that
-    of a `MultiDiscrete`, as Gymnasium defines them. A `Box` with one axis is taken as that of one environment, unless `batched`
+    of a `MultiDiscrete` (scalars as that of one of one choice), as Gymnasium defines them. A `Box` with one axis is taken as that of one environment, unless `batched`
     made it.
     """
     if isinstance(space, spaces.Box) and (len(space.shape) > 1 or getattr(space, _OF_SCALARS, False)):

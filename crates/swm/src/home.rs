@@ -129,6 +129,20 @@ pub fn dataset(given: &str) -> Result<PathBuf> {
     named(given, datasets, DEFAULT_FORMAT)
 }
 
+/// Returns the path of the dataset of this name in [`datasets`], whatever the current folder has of the name; `None` for a path,
+/// and if there is none.
+///
+/// # Errors
+/// As [`home`], if it is a name.
+pub fn named_dataset(given: &str) -> Result<Option<PathBuf>> {
+    if given.starts_with('~') || given.contains(std::path::is_separator) || Path::new(given).extension().is_some() {
+        return Ok(None);
+    }
+    let path = datasets()?.join(given);
+    let mut suffixes = once(DEFAULT_FORMAT).chain(suffixes()).chain(once(""));
+    Ok(suffixes.find_map(|suffix| Some(path.with_extension(suffix)).filter(|path| path.exists())))
+}
+
 /// Returns the location of a dataset given as a path, as a URI, or as a name in [`datasets`]. A dataset of the hub is downloaded
 /// if it is not cached.
 ///

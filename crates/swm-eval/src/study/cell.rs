@@ -94,6 +94,20 @@ impl Cell {
         if self.sequential { of(&EvalRequest { episodes: 0, ..self.request.clone() }) } else { of(&self.request) }
     }
 
+    /// Checks that the hashes of what the names of the request mean now are those of [`Cell::inputs`].
+    ///
+    /// # Errors
+    /// When a dataset or a checkpoint has other content.
+    pub fn check_inputs(&self, found: &BTreeMap<String, String>) -> Result<()> {
+        let differs = |(input, hash): &(&String, &String)| found.get(*input) != Some(*hash);
+        let Some((input, hash)) = self.inputs.iter().find(differs) else { return Ok(()) };
+        let what = format!("the {input} of '{}' of '{}'", self.condition(), self.policy());
+        let now = found.get(input).map_or("no hash", String::as_str);
+        let fix = "resume it where it was started, with that dataset and those weights; or `swm study run` its file again, which \
+                   evaluates what changed";
+        Err(Error::config(what, format!("is another one ({now}) than that of the study ({hash})"), fix))
+    }
+
     /// The name of the condition.
     pub fn condition(&self) -> &str {
         self.request.conditions.first().map_or("", |condition| &condition.name)

@@ -139,8 +139,9 @@ impl StudyFolder {
     /// Stores the results of a cell, without times.
     ///
     /// # Errors
-    /// When writing fails.
+    /// When the dataset or the weights are no longer those of the cell, or writing fails.
     pub fn store(&self, cell: &Cell, mut results: Results) -> Result<()> {
+        cell.check_inputs(&results.manifest.hashes)?;
         for run in &mut results.runs {
             run.timing = Default::default();
         }
@@ -172,7 +173,7 @@ impl StudyFolder {
 /// Whether results are those of the cell's request and inputs.
 fn answers(results: &Results, cell: &Cell) -> Result<bool> {
     let (hashes, episodes) = (&results.manifest.hashes, EvalRequest::of(&results.manifest)?.episodes);
-    let same_inputs = cell.inputs.iter().all(|(input, hash)| hashes.get(input) == Some(hash));
+    let same_inputs = cell.check_inputs(hashes).is_ok();
     let has_all = if cell.sequential {
         results.runs.iter().all(|run| run.episodes.len() == episodes)
     } else {

@@ -42,18 +42,11 @@ impl Study {
         options: &RunOptions,
         control: &mut Control<'_>,
     ) -> Result<()> {
-        let (variables, known) = (self.common_variables(), folder.image_distances()?);
-        let unshifted = self.cells.iter().filter(|cell| cell.condition() == self.unshifted());
-        let references: BTreeMap<String, &Cell> = unshifted.map(|cell| (key(cell, &variables), cell)).collect();
+        let known = folder.image_distances()?;
         // Cells of several policies have the same frames.
         let (mut frames, mut seen, mut found) = (Frames::default(), BTreeMap::new(), ImageDistances::new());
-        for cell in self.cells.iter().filter(|cell| cell.condition() != self.unshifted()) {
+        for (id, reference, cell) in self.compared()? {
             control.check()?;
-            let id = cell.id()?;
-            let Some(reference) = references.get(&key(cell, &variables)).filter(|_| cell.request.image.is_some())
-            else {
-                continue;
-            };
             if let Some(distance) = known.get(&id) {
                 found.insert(id, *distance);
                 continue;
@@ -72,6 +65,34 @@ impl Study {
             found.insert(id, distance);
         }
         folder.store_image_distances(&found, found == known)
+    }
+
+    /// The cells that have an image distance: the id of each, the unshifted cell that it is compared with, and itself.
+    fn compared(&self) -> Result<Vec<(String, &Cell, &Cell)>> {
+        let (variables, unshifted) = (self.common_variables(), self.unshifted());
+        let references = self.cells.iter().filter(|cell| cell.condition() == unshifted);
+        let references: BTreeMap<String, &Cell> = references.map(|cell| (key(cell, &variables), cell)).collect();
+        let shifted = self.cells.iter().filter(|cell| cell.condition() != unshifted && cell.request.image.is_some());
+        let pairs = shifted.filter_map(|cell| Some((*references.get(&key(cell, &variables))?, cell)));
+        pairs.map(|(reference, cell)| Ok((cell.id()?, reference, cell))).collect()
+    }
+
+    /// The cells whose datasets and weights a run still reads: those without all results, and those whose first frames are still to
+    /// be compared.
+    ///
+    /// # Errors
+    /// When the folder is damaged.
+    pub fn unfinished(&self, folder: &StudyFolder) -> Result<Vec<&Cell>> {
+        let mut unfinished = vec![];
+        for cell in &self.cells {
+            if folder.results(cell)?.is_none_or(|results| results.episodes() < cell.request.episodes) {
+                unfinished.push(cell);
+            }
+        }
+        let known = folder.image_distances()?;
+        let compared = self.compared()?.into_iter().filter(|(id, ..)| !known.contains_key(id));
+        unfinished.extend(compared.flat_map(|(_, reference, cell)| [reference, cell]));
+        Ok(unfinished)
     }
 }
 

@@ -69,11 +69,7 @@ impl TrainableConfig for InverseConfig {
 
     fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary> {
         if run.options.resume {
-            return Err(Error::config(
-                "--resume",
-                "an inverse-dynamics run takes seconds and cannot be resumed",
-                "leave out --resume and choose another --output",
-            ));
+            return Err(not_resumed());
         }
         train(self, &world_model(&run)?, run.reader, run.out, run.options.threads, control)
     }
@@ -130,4 +126,10 @@ impl LoadedModel for InverseCheckpoint {
     fn encoder(&self) -> Option<Box<dyn ImageEncoder>> {
         Some(Box::new(self.world_model.clone()))
     }
+}
+
+/// The error of a run that is to be continued.
+pub fn not_resumed() -> Error {
+    let problem = "an inverse-dynamics run takes seconds and cannot be resumed";
+    Error::config("--resume", problem, "leave out --resume and choose another --output")
 }

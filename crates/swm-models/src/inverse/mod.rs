@@ -12,6 +12,6 @@ mod policy;
 mod train;
 
 pub use checkpoint::InverseCheckpoint;
-pub use family::ENTRY;
+pub use family::{ENTRY, not_resumed};
 pub use policy::InversePolicy;
 pub use train::{InverseConfig, check_data, train};

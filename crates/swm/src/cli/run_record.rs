@@ -13,7 +13,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
-use swm_core::files;
+use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
 
 /// The name of the file.
@@ -115,6 +115,9 @@ pub fn check_training(folder: &Path, continued: bool) -> Result<()> {
 /// # Errors
 /// When the folder has a file of this name that is no record of a run, or cannot be written to.
 pub fn record_training(folder: &Path, (command, program): (Vec<String>, &str), continued: bool) -> Result<()> {
+    let path = folder.join(FILE);
+    // A training of `swm train` that prepares its data holds it.
+    drop(files::exists(&path)?.then(|| Lock::file(&path)).transpose()?);
     append(folder, Invocation { command, program: Some(program.to_owned()), ..Invocation::now() }, continued)
 }
 
@@ -232,6 +235,10 @@ mod tests {
         std::fs::write(&left, "{").expect("what a kill leaves");
         record_training(folder.path(), (vec![], "torch"), true).expect("a continued training");
         assert!(!left.exists());
+        let preparing = Lock::file(&folder.path().join(FILE)).expect("a training that prepares its data");
+        let refused = record_training(folder.path(), (vec![], "torch"), false).expect_err("two trainings").to_string();
+        assert!(refused.contains("another process writes to it"), "{refused}");
+        drop(preparing);
         std::fs::write(folder.path().join(FILE), "{\"mine\": 1}").expect("writing a file");
         assert!(write(folder.path(), false).is_err());
         assert!(check_training(folder.path(), false).is_err(), "refused before the work");

@@ -15,7 +15,7 @@ use std::sync::Arc;
 use swm_core::{EnvPool, Error, Origin, Result, files};
 use swm_data::Reader;
 use swm_models::{
-    FAMILIES, FamilyEntry, OnlineRun, StoredCheckpoint, TrainOptions, TrainRun, TrainSummary, TrainableConfig,
+    FAMILIES, FamilyEntry, OnlineRun, StoredCheckpoint, TrainOptions, TrainRun, TrainSummary, TrainableConfig, inverse,
 };
 
 /// Arguments of `swm train`.
@@ -198,28 +198,26 @@ impl TrainArgs {
             return Err(Error::corrupt(path, "it holds no command line of a training", fix));
         };
         self.check_options_of(&started, &folder)?;
-        // Replaced paths are not looked for.
-        let recorded = |option, given: &Option<String>, path: &Option<String>| {
-            let path = path.as_ref().filter(|_| given.is_none());
-            path.map(|path| path_of_record(option, path, from)).transpose()
+        if started.encoder.is_some() {
+            return Err(inverse::not_resumed());
+        }
+        let preset = match &started.preset {
+            Some(preset) if is_preset_file(preset) => Some(path_of_record("--preset", preset, (&folder, from))?),
+            preset => preset.clone(),
         };
-        let data = recorded("--data", &self.data, &started.data)?;
-        let encoder = recorded("--encoder", &self.encoder, &started.encoder)?;
-        let preset = started.preset.as_ref().map(|preset| match is_preset_file(preset) {
-            true => path_of_record("--preset", preset, from),
-            false => Ok(preset.clone()),
-        });
-        let started = Self { data, encoder, preset: preset.transpose()?, ..started };
+        let mut started = Self { preset, ..started };
         // Printing the configuration opens nothing.
         if !self.print_config {
             self.check_names_of(&started, (&folder, from), &Origin::file(&path, false))?;
+            if let (None, Some(data)) = (&self.data, &started.data) {
+                started.data = Some(path_of_record("--data", data, (&folder, from))?);
+            }
             eprint(&format!("continuing: {}\n", output::shorten(record.commands[0].command.join(" "))));
         }
         Ok(Self {
             data: self.data.clone().or(started.data),
             env: self.env.clone().or(started.env),
             max_steps: self.max_steps.or(started.max_steps),
-            encoder: self.encoder.clone().or(started.encoder),
             device: DeviceArgs { device: self.device.device.clone().or(started.device.device) },
             output: Some(output.clone()),
             resume: true,
@@ -241,6 +239,7 @@ impl TrainArgs {
         let trains = if is_online { "trains online in an environment" } else { "trains on a dataset" };
         let options = [
             ("--preset", self.preset.is_some(), "keeps its configuration"),
+            ("--encoder", self.encoder.is_some(), "trains its own encoder"),
             ("--data", self.data.is_some() && is_online, trains),
             ("--feature-cache", self.feature_cache.is_some() && is_online, trains),
             ("--env", self.env.is_some() && !is_online, trains),
@@ -265,14 +264,8 @@ impl TrainArgs {
         if let (None, Some(env)) = (&self.env, &started.env) {
             crate::env(env, origin)?;
         }
-        let names = [
-            ("dataset", &self.data, &started.data, "--data"),
-            ("encoder", &self.encoder, &started.encoder, "--encoder"),
-        ];
-        for (kind, given, name, option) in names {
-            if let Some(name) = name.as_ref().filter(|name| given.is_none() && name.contains("://")) {
-                origin.check_user(&format!("the {kind} {name}"), "which opens a connection", Some(option))?;
-            }
+        if let (None, Some(data)) = (&self.data, started.data.as_ref().filter(|data| data.contains("://"))) {
+            origin.check_user(&format!("the dataset {data}"), "which opens a connection", Some("--data"))?;
         }
         if StoredCheckpoint::read(run).is_err() {
             started.check_weights(from, origin)?;
@@ -369,22 +362,33 @@ fn is_preset_file(preset: &str) -> bool {
     Path::new(preset).extension().is_some_and(|end| end == "toml")
 }
 
-/// Returns a path in the recorded arguments of a run that was started in the folder `from`, as this command finds it in its own
-/// folder. Names and URIs mean the same everywhere.
+/// Returns a path or the name of a dataset in the recorded arguments of a run that was started in the folder `from`, as this command
+/// finds it in its own folder. URIs mean the same everywhere.
 ///
 /// # Errors
-/// When the path is not there any more, and this folder has one of the same name, which may be another.
-fn path_of_record(option: &str, given: &str, from: &Path) -> Result<String> {
-    let there = from.join(given);
-    if is_current(from) || !(there.exists() || Path::new(given).exists()) {
+/// When it is not there any more, this folder has one of the same path, which may be another, and the run has no checkpoint yet, which
+/// would know it by its content.
+fn path_of_record(option: &str, given: &str, (run, from): (&Path, &Path)) -> Result<String> {
+    let (here, there) = (Path::new(given), from.join(given));
+    if is_current(from) || !(there.exists() || here.exists()) {
         return Ok(given.to_owned());
     }
-    if !there.exists() {
-        let problem = format!("the run was started in {}, where it is not any more", from.display());
-        let fix = "put it back, or name the model and all settings of the run: swm train MODEL --output RUN --resume …";
-        return Err(Error::config(format!("{option} {given}"), problem, fix));
+    if there.exists() {
+        return Ok(there.to_string_lossy().into_owned());
     }
-    Ok(there.to_string_lossy().into_owned())
+    if let Some(named) = home::named_dataset(given)?.filter(|_| option == "--data") {
+        return Ok(named.to_string_lossy().into_owned());
+    }
+    if StoredCheckpoint::read(run).is_ok() {
+        return Ok(given.to_owned());
+    }
+    let problem =
+        format!("the run was started in {}, where it is not any more, and has no checkpoint yet", from.display());
+    let fix = match option {
+        "--data" => "put it back, or name the dataset: --data PATH",
+        _ => "put it back, or name the model and all settings of the run: swm train MODEL --output RUN --resume …",
+    };
+    Err(Error::config(format!("{option} {given}"), problem, fix))
 }
 
 /// Whether this is the current folder.

@@ -66,13 +66,17 @@ pub fn entries(folder: &Path) -> Result<Vec<Found>> {
     Ok(found)
 }
 
-/// Adds the entries of a folder. `depth` is the number of levels of folders that may still have some.
+/// Adds the entries of a folder; hidden files and folders have none. `depth` is the number of levels of folders that may still have
+/// some.
 fn add(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
     let io = |error| Error::io(folder, "listing the entries", error);
     for item in std::fs::read_dir(folder).map_err(io)? {
         let item = item.map_err(io)?;
         // The type of the item itself, not that of the target of a link.
         let (kind, path) = (item.file_type().map_err(io)?, item.path());
+        if item.file_name().as_encoded_bytes().starts_with(b".") {
+            continue;
+        }
         let is_entry = path.extension().is_some_and(|end| end == "json");
         let left_out = match kind {
             _ if kind.is_symlink() && (is_entry || path.is_dir()) => Some("is a symbolic link, which is not followed"),
@@ -82,7 +86,7 @@ fn add(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
             _ => None,
         };
         if let Some(problem) = left_out {
-            let fix = "copy the entries into the folder or one directly below, or move this out of it";
+            let fix = "copy the entries into the folder or at most two below, or move this out of it";
             return Err(Error::config(path.display().to_string(), problem, fix));
         }
         if kind.is_dir() {

@@ -355,6 +355,10 @@ fn no_entry_is_left_out() {
     fs::create_dir_all(board.join("1/2/3/4/5")).expect("folders without entries");
     fs::write(board.join("1/2/3/4/5/notes.txt"), "").expect("writing a file");
     std::os::unix::fs::symlink("notes.txt", board.join("1/2/3/4/5/link.txt")).expect("making a link");
+    // Hidden folders belong to other programs.
+    fs::create_dir_all(board.join(".venv/a/b/c")).expect("a hidden folder");
+    fs::write(board.join(".venv/a/b/c/own.json"), "{}").expect("writing a file");
+    std::os::unix::fs::symlink("a", board.join(".venv/lib64")).expect("making a link");
     assert_eq!(entries(&board).expect("an entry").len(), 1);
     let deep = entry("1/2/3/4/entry.json");
     refused(&deep, "too many folders below");

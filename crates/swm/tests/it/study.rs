@@ -482,6 +482,44 @@ fn results_of_another_evaluation_are_refused() {
     swm.fails(&["study", "status", "out"], 1, &["same evaluation"]);
 }
 
+/// The dataset of the name in the study is another one in another folder, and after more episodes are collected.
+#[test]
+fn a_study_is_not_resumed_with_another_dataset() {
+    let swm = with_study();
+    let recorded = "episodes = 6\ngoal-offset = 5\nno-pixels = true";
+    let study = STUDY.replace("episodes = 6", recorded).replace("image = \"32\"\n", "");
+    let study = format!("{study}\n[[starts]]\nname = \"recorded\"\ndataset = \"./d.lance\"\n");
+    std::fs::write(swm.path("study.toml"), study).expect("writing the study");
+    let collect = |more: &[&str]| {
+        let args = [&["collect", "swm/TwoRoom-v1", "--no-pixels", "--max-steps", "20"], more].concat();
+        swm.json(&args);
+    };
+    collect(&["--output", "d.lance", "--episodes", "8"]);
+    collect(&["--output", "other/d.lance", "--episodes", "8", "--seed", "1"]);
+    swm.json(&["study", "run", "study.toml", "--output", "out"]);
+    let whole = contents(&swm.path("out"));
+    let removed = whole.keys().find(|name| name.starts_with("cells/")).expect("a cell");
+    std::fs::remove_file(swm.path("out").join(removed)).expect("removing a cell");
+    let rest = contents(&swm.path("out"));
+    let refused = |args: &[&str], cwd: &str| {
+        let output = swm.command(args).current_dir(swm.path(cwd)).output().expect("running swm");
+        let message = text(&output.stderr);
+        assert!(output.status.code() == Some(2) && message.contains("the dataset of '"), "{args:?}: {message}");
+        assert_eq!(contents(&swm.path("out")), rest, "nothing is written");
+    };
+    let id = removed.trim_start_matches("cells/").trim_end_matches(".json");
+    refused(&["study", "resume", "../out"], "other");
+    refused(&["study", "resume", "../out", "--cell", id], "other");
+    swm.json(&["study", "resume", "out"]);
+    assert_eq!(contents(&swm.path("out")), whole);
+    std::fs::remove_file(swm.path("out").join(removed)).expect("removing a cell");
+    collect(&["--output", "d.lance", "--episodes", "9", "--resume"]);
+    refused(&["study", "resume", "out"], ".");
+    // A complete study needs no dataset.
+    std::fs::write(swm.path("out").join(removed), &whole[removed]).expect("the cell");
+    swm.json(&["study", "resume", "out"]);
+}
+
 /// The commands of a study, one to a line.
 fn commands(swm: &Swm, study: &str) -> String {
     std::fs::write(swm.path("study.toml"), study).expect("writing the study");

@@ -2,6 +2,7 @@
 //! recognised by their content.
 
 use crate::{Swm, text};
+use std::path::Path;
 
 /// Collects a dataset and trains a model of a few steps on it.
 fn trained(swm: &Swm) {
@@ -106,6 +107,42 @@ fn a_run_continues_with_the_files_of_the_folder_where_it_was_started() {
         std::fs::rename(swm.path("a/moved"), swm.path("a").join(name)).expect("moving a file");
     }
     assert!(record() == before, "a command line that trained nothing is in the record");
+    // A named dataset is no file of that folder.
+    std::fs::create_dir_all(swm.path("datasets")).expect("making a folder");
+    std::fs::rename(swm.path("a/d.lance"), swm.path("datasets/rooms.lance")).expect("moving the dataset");
+    let renamed = String::from_utf8(before).expect("text").replace("\"d.lance\"", "\"rooms\"");
+    std::fs::write(swm.path("run/run.json"), renamed).expect("writing run.json");
+    std::fs::create_dir(swm.path("b/rooms")).expect("making a folder");
+    let resumed = run_in("b", &resume);
+    assert!(resumed.status.success() && manifest() == first, "{}", text(&resumed.stderr));
+}
+
+#[test]
+fn a_run_with_a_checkpoint_continues_in_a_folder_that_was_moved() {
+    let swm = Swm::new();
+    trained(&swm);
+    let project = swm.path("project");
+    std::fs::create_dir(&project).expect("making a folder");
+    std::fs::rename(swm.path("datasets/rooms.lance"), project.join("d.lance")).expect("moving the dataset");
+    let run_in = |folder: &Path, args: &[&str]| swm.command(args).current_dir(folder).output().expect("swm runs");
+    let print = ["train", "pldm", "--data", "d.lance", "--print-config", "schedule.steps=2", "data.batch_size=8"];
+    std::fs::write(project.join("p.toml"), run_in(&project, &print).stdout).expect("writing a preset");
+    let train = ["train", "pldm", "--data", "d.lance", "--preset", "p.toml", "-o", "./run"];
+    let started = run_in(&project, &train);
+    assert!(started.status.success(), "{}", text(&started.stderr));
+    let moved = swm.path("moved");
+    std::fs::rename(&project, &moved).expect("moving the folder");
+    let resume = ["train", "-o", "./run", "--resume"];
+    let resumed = run_in(&moved, &resume);
+    assert!(resumed.status.success(), "{}", text(&resumed.stderr));
+    // Its content tells the dataset from another one.
+    let collect = ["collect", "swm/TwoRoom-v1", "-o", "d.lance", "--episodes", "10", "--image", "64", "--overwrite"];
+    assert!(run_in(&moved, &collect).status.success());
+    let refused = run_in(&moved, &resume);
+    assert!(text(&refused.stderr).contains("other data"), "{}", text(&refused.stderr));
+    std::fs::remove_dir_all(moved.join("run/checkpoint")).expect("removing the checkpoint");
+    let refused = run_in(&moved, &resume);
+    assert!(text(&refused.stderr).contains("has no checkpoint yet"), "{}", text(&refused.stderr));
 }
 
 #[test]

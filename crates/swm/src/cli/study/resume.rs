@@ -1,5 +1,6 @@
 //! `swm study resume`: evaluates what the folder of a study lacks.
 
+use super::expand::Inputs;
 use super::{export_table, show, tables};
 use crate::cli::config::count;
 use crate::cli::eval::{run_options, write_json};
@@ -10,7 +11,7 @@ use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
 use swm_core::{Error, Origin, limits};
-use swm_eval::{AnyStudy, StudyFolder, TableStudy};
+use swm_eval::{AnyStudy, Study, StudyFolder, TableStudy};
 
 /// The file with the ids of the cells that a stage leaves open.
 const OPEN: &str = "open.json";
@@ -57,6 +58,7 @@ pub fn run(args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
         write_json(&args.folder.join(OPEN), &open)?;
         return emit_json(&json!({"open": open.len()}));
     }
+    check_inputs(&study, args.cell.as_deref(), &folder, &resolver)?;
     if let Some(id) = &args.cell {
         study.run_cell(id, args.stage, &folder, &resolver, &options, control)?;
         if context.json {
@@ -67,6 +69,25 @@ pub fn run(args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
     }
     study.run(&folder, &resolver, &options, control)?;
     show(&study.results(&folder)?, context.json)
+}
+
+/// Checks that the datasets and checkpoints of all cells that are not done, or of the only one, are those of the study: their names may mean
+/// something else in another folder, or after a change.
+fn check_inputs(
+    study: &Study,
+    only: Option<&str>,
+    folder: &StudyFolder,
+    resolver: &HomeResolver,
+) -> anyhow::Result<()> {
+    let cells = match only {
+        Some(only) => study.cells.iter().filter(|cell| cell.id().is_ok_and(|id| id == only)).collect(),
+        None => study.unfinished(folder)?,
+    };
+    let mut inputs = Inputs::new(resolver);
+    for cell in cells {
+        cell.check_inputs(&inputs.of(&cell.request)?)?;
+    }
+    Ok(())
 }
 
 /// Fills the rows that a study of another kind lacks.

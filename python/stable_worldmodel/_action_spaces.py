@@ -28,8 +28,8 @@ def single(space: Any, envs: int) -> Any:
     """The action space of one environment, given that space or the batched space of `envs` environments.
 
     A `MultiDiscrete` of `envs` equal sizes is taken as the batched space of a `Discrete`, and a `Box` of whole numbers as that
-    of a `MultiDiscrete` (scalars as that of one of one choice), as Gymnasium defines them. A `Box` with one axis is taken as that of one environment, unless `batched`
-    made it.
+    of a `MultiDiscrete` (of one choice, if they are scalars), as Gymnasium defines them. A `Box` with one axis is taken as that
+    of one environment, unless `batched` made it.
     """
     if isinstance(space, spaces.Box) and (len(space.shape) > 1 or getattr(space, _OF_SCALARS, False)):
         low, high = space.low[0], space.high[0]

@@ -3,10 +3,11 @@
 use crate::cli::recipes::is_preset_name;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::collections::BTreeSet;
-use swm_core::{Error, Origin, Result, limits};
+use swm_core::{Error, Origin, Result, limits, manifest};
 use swm_eval::Study;
+use swm_models::{FAMILIES, TrainableConfig};
 use toml::Table;
 
 /// Who chose the settings of a study.
@@ -44,6 +45,39 @@ impl<'a> Chosen<'a> {
         }
         self.by("preset").check_user(&format!("the preset '{preset}'"), "which is a file", Some("preset=FILE"))
     }
+}
+
+/// Adds to the request of a row that trains with a preset which is a file what the file says: the hash of the configuration. With
+/// another content, it is another row.
+///
+/// # Errors
+/// When the file cannot be read or is no preset.
+pub(super) fn add_config(request: &mut Value, family: &str, preset: &str, settings: &[String]) -> Result<()> {
+    if !is_preset_name(preset) {
+        request[CONFIG] = json!(config_hash(&*(FAMILIES.get(family)?.config)(preset, settings)?));
+    }
+    Ok(())
+}
+
+/// Checks that the preset of a row is still what it was when the study was made.
+///
+/// # Errors
+/// When its file has another content.
+pub(super) fn check_config(request: &Value, preset: &str, config: &dyn TrainableConfig) -> Result<()> {
+    if request.get(CONFIG).is_none_or(|hash| *hash == json!(config_hash(config))) {
+        return Ok(());
+    }
+    let problem = "is another one than that of the study";
+    let fix =
+        "resume it where it was started, with that file; or `swm study run` its file again, for rows of their own";
+    Err(Error::config(format!("the preset '{preset}'"), problem, fix))
+}
+
+/// The key of the hash in a request.
+const CONFIG: &str = "config";
+
+fn config_hash(config: &dyn TrainableConfig) -> String {
+    manifest::hash(config.to_json().to_string().as_bytes())
 }
 
 /// Reads the settings of a study; those that are not given have their defaults.
@@ -105,4 +139,44 @@ pub(super) fn check_cells(lengths: &[usize]) -> Result<()> {
         return Err(Error::config("the study", problem, format!("give at most {}", Study::MAX_CELLS)));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::any_file::Size;
+    use super::super::tables::TableFile;
+    use super::*;
+    use std::path::Path;
+
+    #[test]
+    fn rows_know_the_content_of_a_preset_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let preset = folder.path().join("own.toml");
+        let of = "title = \"T\"\nquestion = \"q?\"\n[defaults]\n";
+        for text in [
+            format!("kind = \"drift\"\n{of}env = \"swm/PushT-v1\"\ndataset = \"states\"\n"),
+            format!("kind = \"online\"\n{of}envs = [\"swm/PendulumControl-v1\"]\nfamilies = [\"tdmpc2\"]\n"),
+        ] {
+            let [narrow, wide] = ["8", "16"].map(|hidden| {
+                let config =
+                    (FAMILIES.get("tdmpc2").expect("a family").config)("tiny", &[format!("model.hidden={hidden}")]);
+                let config = config.expect("a configuration");
+                std::fs::write(&preset, config.to_toml().expect("TOML")).expect("writing a preset");
+                let file = TableFile::parse(&text, Path::new("study.toml")).expect("a file");
+                let own = [format!("preset={}", preset.display())];
+                let made = file.study(Size::Paper, &own, &Origin::User).expect("a study");
+                made.cells[0].clone()
+            });
+            assert_ne!(narrow.id().expect("an id"), wide.id().expect("an id"));
+            let path = preset.to_string_lossy();
+            let settings: Vec<String> = match wide.request["settings"].as_array() {
+                Some(settings) => settings.iter().filter_map(|set| Some(set.as_str()?.to_owned())).collect(),
+                None => vec!["seed=0".to_owned(), "schedule.steps=6000".to_owned()],
+            };
+            let config = (FAMILIES.get("tdmpc2").expect("a family").config)(&path, &settings).expect("a configuration");
+            check_config(&wide.request, &path, &*config).expect("the same file");
+            let error = check_config(&narrow.request, &path, &*config).expect_err("another").to_string();
+            assert!(error.contains("own.toml': is another one"), "{error}");
+        }
+    }
 }

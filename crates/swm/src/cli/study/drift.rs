@@ -4,7 +4,7 @@
 //! the same starts. Each row has the distance of their latents to the nearest latent of the training episodes, and its paths
 //! are the latents along the two principal components of those.
 
-use super::chosen::Chosen;
+use super::chosen::{Chosen, add_config, check_config};
 use crate::cli::{Context, train_folder};
 use crate::{home, resolver};
 use serde::{Deserialize, Serialize};
@@ -116,17 +116,20 @@ impl DriftSettings {
     }
 
     /// A row for the held-out episodes, then one for each policy. `collected` are the commands that collect the dataset.
-    pub(super) fn cells(&self, collected: &[Vec<String>]) -> Vec<TableCell> {
-        let cell = |row: &str| TableCell {
-            name: row.to_owned(),
-            request: json!({
+    ///
+    /// # Errors
+    /// When the preset is a file and cannot be read.
+    pub(super) fn cells(&self, collected: &[Vec<String>]) -> Result<Vec<TableCell>> {
+        let cell = |row: &str| {
+            let mut request = json!({
                 "kind": "drift",
                 "row": row,
                 "settings": self,
                 "collected": collected,
                 "version": env!("CARGO_PKG_VERSION"),
-            }),
-            published: vec![],
+            });
+            add_config(&mut request, FAMILY, &self.preset, &self.overrides())?;
+            Ok(TableCell { name: row.to_owned(), request, published: vec![] })
         };
         std::iter::once(HELD_OUT).chain(POLICIES).map(cell).collect()
     }
@@ -165,6 +168,7 @@ impl Trained {
         let choice = crate::env(&settings.env, &Origin::User)?;
         let reader = home::open_dataset(&settings.dataset)?;
         let config = (FAMILIES.get(FAMILY)?.config)(&settings.preset, &settings.overrides())?;
+        check_config(&cell.request, &settings.preset, &*config)?;
         let out = folder.model(&model_name(&cell.request)?)?;
         train_folder::check_links(&out)?;
         let options = TrainOptions {
@@ -313,7 +317,7 @@ mod tests {
         let settings =
             DriftSettings { env: "swm/PushT-v1".to_owned(), dataset: "push-t".to_owned(), ..DriftSettings::default() };
         settings.check(&Chosen::by_user()).expect("settings");
-        let cells = settings.cells(&[]);
+        let cells = settings.cells(&[]).expect("cells");
         assert_eq!(cells.len(), 5);
         let models: Vec<String> = cells.iter().map(|cell| model_name(&cell.request).expect("a name")).collect();
         assert!(models.iter().all(|model| *model == models[0]), "all rows have one model");

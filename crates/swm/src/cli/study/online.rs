@@ -1,6 +1,6 @@
 //! Studies of the kind `online`: returns and learning curves of models that train by interaction.
 
-use super::chosen::{Chosen, check_cells};
+use super::chosen::{Chosen, add_config, check_cells, check_config};
 use crate::cli::{Context, train_folder};
 use crate::home;
 use serde::{Deserialize, Serialize};
@@ -99,32 +99,34 @@ impl OnlineSettings {
     }
 
     /// A row for each environment, family and training seed. `published` returns the values of a row without its seed.
-    pub(super) fn cells(&self, published: impl Fn(&str) -> Vec<Option<f64>>) -> Vec<TableCell> {
+    ///
+    /// # Errors
+    /// When the preset is a file and cannot be read.
+    pub(super) fn cells(&self, published: impl Fn(&str) -> Vec<Option<f64>>) -> Result<Vec<TableCell>> {
         let mut cells = vec![];
         for env in &self.envs {
             for family in &self.families {
                 let run = format!("{}, {family}", short(env));
                 for seed in &self.seeds {
                     let seeded = if self.seeds.len() > 1 { format!(", seed {seed}") } else { String::new() };
-                    cells.push(TableCell {
-                        name: format!("{run}{seeded}"),
-                        request: json!({
-                            "kind": "online",
-                            "env": env,
-                            "family": family,
-                            "preset": self.preset,
-                            "seed": seed,
-                            "settings": self.overrides(family, *seed),
-                            "episodes": self.episodes,
-                            "max-steps": self.max_steps,
-                            "version": env!("CARGO_PKG_VERSION"),
-                        }),
-                        published: published(&run),
+                    let settings = self.overrides(family, *seed);
+                    let mut request = json!({
+                        "kind": "online",
+                        "env": env,
+                        "family": family,
+                        "preset": self.preset,
+                        "seed": seed,
+                        "settings": settings,
+                        "episodes": self.episodes,
+                        "max-steps": self.max_steps,
+                        "version": env!("CARGO_PKG_VERSION"),
                     });
+                    add_config(&mut request, family, &self.preset, &settings)?;
+                    cells.push(TableCell { name: format!("{run}{seeded}"), request, published: published(&run) });
                 }
             }
         }
-        cells
+        Ok(cells)
     }
 
     /// The settings of the training configuration.
@@ -171,6 +173,7 @@ pub(super) fn measure(cell: &TableCell, context: &Context, control: &mut Control
     let settings: Vec<String> =
         request["settings"].as_array().into_iter().flatten().filter_map(|set| Some(set.as_str()?.to_owned())).collect();
     let config = (FAMILIES.get(text("family"))?.config)(text("preset"), &settings)?;
+    check_config(request, text("preset"), &*config)?;
     let threads = swm_core::pool::threads(context.threads)?;
     let environments = |count: usize| {
         let envs = (0..count).map(|_| choice.env()).collect::<Result<Vec<_>>>()?;
@@ -254,12 +257,12 @@ mod tests {
     fn settings_that_no_run_can_have_are_errors() {
         let settings = OnlineSettings { envs: vec!["swm/PendulumControl-v1".to_owned()], ..OnlineSettings::default() };
         settings.check(&Chosen::by_user()).expect("settings");
-        let cells = settings.cells(|run| vec![(run == "PendulumControl-v1, sac").then_some(-150.0)]);
+        let cells = settings.cells(|run| vec![(run == "PendulumControl-v1, sac").then_some(-150.0)]).expect("cells");
         assert_eq!(cells.iter().map(|cell| cell.published[0]).collect::<Vec<_>>(), [None, Some(-150.0)]);
         let train = |family: &str| [(family.to_owned(), vec!["model.hidden=8".to_owned()])].into();
         let own = OnlineSettings { train: train("sac"), ..settings.clone() };
         own.check(&Chosen::by_user()).expect("settings of a family");
-        assert_eq!(own.cells(|_| vec![None])[1].request["settings"][0], "model.hidden=8");
+        assert_eq!(own.cells(|_| vec![None]).expect("cells")[1].request["settings"][0], "model.hidden=8");
         for (wrong, part) in [
             (OnlineSettings { steps: 7, ..settings.clone() }, "multiple of 5"),
             (OnlineSettings { train: train("lewm"), ..settings.clone() }, "unknown family 'lewm'"),

@@ -152,12 +152,12 @@ impl TableFile {
             TableKind::Online => {
                 let settings: OnlineSettings = settings_of(merged)?;
                 settings.check(&chosen)?;
-                ("run", online::columns(), settings.cells(|run| self.published_of(run, 1)))
+                ("run", online::columns(), settings.cells(|run| self.published_of(run, 1))?)
             }
             TableKind::Drift => {
                 let settings: DriftSettings = settings_of(merged)?;
                 settings.check(&chosen)?;
-                ("policy", drift::columns(), settings.cells(&self.datasets(size)?.commands()))
+                ("policy", drift::columns(), settings.cells(&self.datasets(size)?.commands())?)
             }
         };
         let study = TableStudy {

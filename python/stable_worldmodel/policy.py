@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium import spaces
 
 from . import _engine, _options
 from ._action_spaces import single
@@ -597,8 +598,11 @@ def _process(given: Mapping[str, Any] | None, model: Any) -> dict[str, Any]:
 
 def _executed(step: np.ndarray, space: Any) -> np.ndarray:
     """A planned step as an action: clipped to a `Box`, or the choices of one-hot vectors."""
-    if space.dtype.kind == "f":
-        return np.clip(step.reshape(space.shape), space.low, space.high).astype(space.dtype)
+    if isinstance(space, spaces.Box):
+        # A `Box` of whole numbers with few options is a `MultiDiscrete` here.
+        step = step if space.dtype.kind == "f" else step.round()
+        clipped: np.ndarray = np.clip(step.reshape(space.shape), space.low, space.high).astype(space.dtype)
+        return clipped
     sizes = [int(n) for n in np.reshape(getattr(space, "nvec", getattr(space, "n", 0)), -1)]
     if step.size == len(sizes):
         return step.round().astype(space.dtype)

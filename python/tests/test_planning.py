@@ -1058,6 +1058,32 @@ def test_scalar_actions_have_one_dimension_for_any_number_of_environments(envs, 
     assert solver.action_dim == 2
 
 
+def test_spaces_whose_rows_differ_are_those_of_no_equal_environments():
+    box = gymnasium.spaces.Box(np.float32([[-1, -1], [-5, -9]]), np.float32([[1, 1], [5, 9]]))
+    choices = gymnasium.spaces.MultiDiscrete([[3, 2], [4, 5]])
+    for space, kind in ((box, solvers.CEMSolver), (choices, solvers.CategoricalCEMSolver)):
+        solver = kind(Still(), num_samples=4, n_steps=2, topk=2)
+        with pytest.raises(ValueError, match="rows that differ"):
+            solver.configure(action_space=space, n_envs=2, config=swm.PlanConfig(1, 1))
+            solver.solve({"x": np.zeros((2, 1, 1), np.float32)})
+
+
+def test_plans_of_whole_numbers_with_many_options_are_rounded():
+    class Wide:
+        action_space, num_envs = gymnasium.spaces.Box(0, 2**21, (1, 2), np.int32), 1
+
+    class Numbers:
+        def configure(self, **given):
+            pass
+
+        def solve(self, infos, init_action=None):
+            return {"actions": np.array([[[2.6, 2.0**22]]])}
+
+    policy = swm.policy.MPCPolicy(Numbers(), swm.PlanConfig(1, 1))
+    policy.set_env(Wide())
+    assert policy.get_action({"x": np.zeros((1, 1, 1), np.float32)}).tolist() == [[3, 2**21]]
+
+
 def test_complex_plans_are_refused():
     class Phases:
         def configure(self, **given):

@@ -74,3 +74,27 @@ def test_noise_keeps_actions_beyond_one(tmp_path):
 def test_noise_is_clipped_at_the_bound_that_there_is(tmp_path):
     _, actions = collected(tmp_path / "clipped.lance", "Above", Constant(5.0), action_noise=0.5)
     assert actions.min() == 5.0 and actions.max() > 5.5
+
+
+class Half(Unbounded):
+    """An environment whose actions are in half precision."""
+
+    def __init__(self, render_mode=None):
+        self.action_space = spaces.Box(-np.inf, np.inf, (1,), np.float16)
+        self.render_mode = render_mode
+
+    def step(self, action):
+        assert action.dtype == np.float16
+        return action.astype(np.float32), 0.0, False, False, {}
+
+
+if "Half-v0" not in gymnasium.registry:
+    gymnasium.register("Half-v0", entry_point=Half, max_episode_steps=50)
+
+
+def test_actions_that_half_precision_does_not_hold_are_refused():
+    world = swm.World("Half-v0", num_envs=2, image_shape=(16, 16))
+    world.reset(seed=0)
+    world.envs.step(np.full((2, 1), 6e4))
+    with pytest.raises(ValueError, match=r"the action \[100000.\] is outside the numbers of float16"):
+        world.envs.step(np.array([[1.0], [1e5]]))

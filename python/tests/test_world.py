@@ -310,6 +310,11 @@ def test_discrete_actions_are_whole_numbers():
     for wrong in (1j, np.complex64(1j), "1"):
         with pytest.raises(ValueError, match="actions: expected real actions, got complex numbers or texts"):
             world.envs.step(np.array([1, wrong], object))
+    for wrong, words in ((np.uint64([2**64 - 1, 0]), "integers of int64"), (np.array([1e300, 0]), "integers of int64")):
+        with pytest.raises(ValueError, match=f"actions: expected {words}"):
+            world.envs.step(wrong)
+    with pytest.raises(ValueError, match="actions: expected actions without masked values"):
+        world.envs.step(np.ma.array([1, 0], mask=[True, False]))
     # Floats have no such number.
     with pytest.raises(ValueError, match=f"discrete action .{2**53 + 1}"):
         world.envs.step(np.array([2**53 + 1, 0], object))

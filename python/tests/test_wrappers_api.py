@@ -86,7 +86,7 @@ def test_env_pool_steps_chosen_environments():
         pool.step(np.zeros((3, 2)))
     _, infos = pool.reset(seed=[5, None, 7])
     assert infos["observation"].shape == (3, 1, 1) and infos["goal"].shape == (3, 1, 20, 30, 3)
-    assert pool.seeds.tolist() == [5, 0, 7] and pool.action_space.shape == (3, 2) and pool.num_envs == 3
+    assert pool.seeds.tolist() == [5, -1, 7] and pool.action_space.shape == (3, 2) and pool.num_envs == 3
     actions = np.arange(6, dtype=np.float32).reshape(3, 2) / 6
     _, rewards, terminateds, _, stepped = pool.step(actions, mask=[True, False, True])
     assert stepped is infos and rewards.tolist() == [1, 0, 1] and not terminateds.any()
@@ -96,7 +96,7 @@ def test_env_pool_steps_chosen_environments():
     _, _, terminateds, _, _ = pool.step(actions)
     assert terminateds.tolist() == [True, False, True]
     pool.reset(seed=9, mask=[True, False, False])
-    assert infos["observation"].ravel().tolist() == [0, 2, 3] and pool.seeds.tolist() == [9, 0, 7]
+    assert infos["observation"].ravel().tolist() == [0, 2, 3] and pool.seeds.tolist() == [9, -1, 7]
     with pytest.raises(ValueError, match="3 values"):
         pool.reset(seed=[1])
 
@@ -191,6 +191,51 @@ def test_pools_convert_values_that_their_infos_can_hold():
     _, _, terminateds, _, infos = pool.step(np.zeros((2, 1)))
     assert terminateds.all() and infos["count"].ravel().tolist() == [5, 5] and infos["small"].dtype == np.uint8
     assert infos["vector"][1, 0].tolist() == [1, 2, 3] and infos["name"] == [["b"], ["b"]]
+
+
+class Hitting(gymnasium.Env):
+    """Says whether it hit something from its second step on, in the first episode only, and returns one reward."""
+
+    observation_space, action_space = gymnasium.spaces.Box(-1, 1, (1,)), gymnasium.spaces.Discrete(3)
+
+    def __init__(self, reward=1.0, name=None):
+        self.reward, self.name, self.resets = reward, name, 0
+
+    def reset(self, *, seed=None, options=None):
+        self.resets, self.steps = self.resets + 1, 0
+        infos = {"name": self.name} if self.name else {"score": np.float32(2)}
+        return np.zeros(1, np.float32), {**infos, "hit": False} if self.resets == 1 else infos
+
+    def step(self, action):
+        self.steps += 1
+        infos = {"hit": self.steps > 1} if self.resets == 1 else {}
+        return np.zeros(1, np.float32), self.reward, False, False, infos
+
+
+@pytest.mark.parametrize("reward", [None, "3", np.complex64(1 + 2j), 1e300, [1.0, 2.0]])
+def test_pools_refuse_rewards_that_are_no_numbers_of_single_precision(reward):
+    pool = EnvPool([lambda: Hitting(reward)])
+    pool.reset(seed=0)
+    with pytest.raises(ValueError, match="reward: .*; expected a number"):
+        pool.step([0])
+
+
+def test_infos_of_pools_are_those_of_the_episode():
+    pool = EnvPool([Hitting, lambda: Hitting(np.ones(1), "b")])
+    _, infos = pool.reset(seed=5)
+    assert infos["score"].ravel().tolist() == [2, 0] and infos["name"] == [[None], ["b"]]
+    pool.step([0, 0])
+    _, rewards, *_, infos = pool.step([0, 0])
+    assert infos["hit"].ravel().tolist() == [True, True] and rewards.tolist() == [1, 1]
+    _, infos = pool.reset(mask=[True, False])
+    assert infos["hit"].ravel().tolist() == [False, True] and pool.seeds.tolist() == [-1, 6]
+    pool.reset()
+    assert pool.seeds.tolist() == [-1, -1]
+    for wrong in ([True, False, True], [True], [2, 0], [[True, True]]):
+        with pytest.raises(ValueError, match="mask: expected 2 values, true or false"):
+            pool.step([0, 0], mask=wrong)
+        with pytest.raises(ValueError, match="mask: expected 2 values, true or false"):
+            pool.reset(mask=wrong)
 
 
 def test_the_environments_of_a_world_are_a_pool():

@@ -245,7 +245,10 @@ class Actions:
             begin, at = at, at + math.prod(space.shape or (1,))
             if isinstance(space, spaces.Discrete):
                 return int(values[begin])
-            value = values[begin:at].astype(space.dtype).reshape(space.shape)
+            with np.errstate(over='ignore'):
+                value = values[begin:at].astype(space.dtype).reshape(space.shape)
+            if space.dtype == np.float16 and not np.isfinite(value).all():
+                raise ValueError(f'the action {values[begin:at]} is outside the numbers of float16, the type of the action space')
             if isinstance(space, spaces.Box) and space.dtype == np.float64:
                 # Rounding to single precision may move a bound outside the space.
                 for side in (space.low, space.high):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["EnvPool", "WorldEnvs"]
 
+#: An entry that the info of an environment lacks.
+_MISSING: Any = object()
+
 
 class EnvPool:
     """Gymnasium environments that are stepped one after another, in this interpreter, with their infos as one batch.
@@ -33,7 +36,8 @@ class EnvPool:
         env_fns: Functions without arguments that create the environments.
 
     Infos are one dict for all environments, which every step overwrites: arrays and tensors `(num_envs, 1, ..)`, and lists
-    `[[value], ..]` of other values. The columns are those of the first reset.
+    `[[value], ..]` of other values. The columns are those of the last reset of all environments. A missing entry repeats
+    the last value of the episode; before its first, it is 0, or `None` in a list.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], Any]]) -> None:
@@ -41,8 +45,8 @@ class EnvPool:
         self.envs: list[Any] = [create() for create in env_fns]
         if not self.envs:
             raise ValueError("EnvPool: no environments; expected functions that create them")
-        #: The seeds of the last resets.
-        self.seeds: np.ndarray = np.zeros(len(self.envs), np.int64)
+        #: The seeds of the last resets; -1 for those without one.
+        self.seeds: np.ndarray = np.full(len(self.envs), -1, np.int64)
         #: The number of resets of every environment, by which policies find out that an episode began.
         self._resets: np.ndarray = np.zeros(len(self.envs), np.int64)
         self._infos: dict[str, Any] | None = None
@@ -113,14 +117,16 @@ class EnvPool:
         for env in self._chosen(mask):
             _, started[env] = self.envs[env].reset(seed=seeds[env], options=given[env])
             self._resets[env] += 1
-            if seeds[env] is not None:
-                self.seeds[env] = seeds[env]
+            self.seeds[env] = -1 if seeds[env] is None else seeds[env]
         if len(started) == count:
-            self._infos = {key: _column([started[env][key] for env in range(count)]) for key in started[0]}
+            infos = [started[env] for env in range(count)]
+            keys = dict.fromkeys(key for info in infos for key in info)
+            self._infos = {key: _column([info.get(key, _MISSING) for info in infos]) for key in keys}
         elif self._infos is None:
             raise ValueError("mask: the first reset must be one of all environments")
         else:
             for env, info in started.items():
+                self._clear(env, self._infos.keys() - info.keys())
                 self._write(env, info)
         return None, self._known()
 
@@ -148,7 +154,8 @@ class EnvPool:
                 f"got {actions!r}"
             )
         for env in self._chosen(mask):
-            _, rewards[env], terminated, truncated, info = self.envs[env].step(actions[env])
+            _, reward, terminated, truncated, info = self.envs[env].step(actions[env])
+            rewards[env] = _reward(reward)
             terminateds[env], truncateds[env] = _flag("terminated", terminated), _flag("truncated", truncated)
             self._write(env, info)
         return None, rewards, terminateds, truncateds, self._known()
@@ -159,7 +166,22 @@ class EnvPool:
             env.close()
 
     def _chosen(self, mask: Any) -> list[int]:
-        return [env for env in range(self.num_envs) if mask is None or mask[env]]
+        """The environments that a mask chooses."""
+        if mask is None:
+            return list(range(self.num_envs))
+        chosen = _tensors.to_numpy(mask)
+        if chosen.shape != (self.num_envs,) or not np.isin(chosen, (False, True)).all():
+            raise ValueError(f"mask: expected {self.num_envs} values, true or false, one for each environment, got {mask!r}")
+        return np.flatnonzero(chosen).tolist()
+
+    def _clear(self, env: int, keys: Iterable[str]) -> None:
+        """Sets entries of an environment to what they are before their first value."""
+        for key in keys:
+            column = self._known()[key]
+            if isinstance(column, list):
+                column[env][0] = None
+            else:
+                column[env] = 0
 
     def _known(self) -> dict[str, Any]:
         if self._infos is None:
@@ -213,6 +235,18 @@ def _is_rows(space: spaces.Space[Any], rows: Any, count: int) -> bool:
     return not isinstance(rows, (tuple, list)) and np.shape(rows) == (count, *space.shape)
 
 
+def _reward(value: Any) -> np.float32:
+    """A reward in single precision."""
+    array = _tensors.to_numpy(value)
+    if array.dtype.kind not in "biuf" or array.size != 1:
+        raise ValueError(f"reward: {value!r}; expected a number")
+    with np.errstate(over="ignore"):
+        stored = np.float32(array.item())
+    if np.isinf(stored) and np.isfinite(array).all():
+        raise ValueError(f"reward: {value!r}; expected a number of single precision, at most 3.4e38")
+    return stored
+
+
 def _flag(name: str, value: Any) -> bool:
     """Whether an episode ended."""
     if np.ndim(value) != 0 or value not in (False, True):
@@ -222,14 +256,14 @@ def _flag(name: str, value: Any) -> bool:
 
 def _column(values: list[Any]) -> Any:
     """The values of the environments as an array or tensor `(num_envs, 1, ..)`, or as a list."""
-    first = values[0]
+    first = next(value for value in values if value is not _MISSING)
     if hasattr(first, "detach"):
         import torch
 
-        return torch.stack(values).unsqueeze(1)
+        return torch.stack([torch.zeros_like(first) if value is _MISSING else value for value in values]).unsqueeze(1)
     if isinstance(first, (np.ndarray, np.number, np.bool_, bool, int, float)):
-        return np.stack([np.asarray(value) for value in values])[:, None]
-    return [[value] for value in values]
+        return np.stack([np.zeros_like(first) if value is _MISSING else np.asarray(value) for value in values])[:, None]
+    return [[None if value is _MISSING else value] for value in values]
 
 
 class WorldEnvs(EnvPool):

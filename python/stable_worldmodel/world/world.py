@@ -526,8 +526,11 @@ class World:
         """Actions `(num_envs, ..)` in the shape and type of the engine.
 
         Raises:
-            ValueError: If they have another shape, or those of active environments are not finite real numbers.
+            ValueError: If they have another shape, or those of active environments are masked, not finite, not real, or too
+                large.
         """
+        if np.ma.is_masked(given):
+            raise ValueError(f"{what}: expected actions without masked values, got {given}")
         given = given.detach().cpu().numpy() if hasattr(given, "detach") else np.asarray(given)
         want = self._actions
         if given.size != want.size or given.shape[:1] != want.shape[:1]:
@@ -550,6 +553,11 @@ class World:
             if given.dtype.kind == "f" and (given[active] % 1).any():
                 raise ValueError(f"{what}: expected whole numbers, got {given[active]}")
             given = np.nan_to_num(given, nan=0)
+            with np.errstate(invalid="ignore"):
+                whole = given.astype(want.dtype)
+            if (whole != given)[active].any():
+                raise ValueError(f"{what}: expected integers of {want.dtype}, got {given[active]}")
+            given = whole
         return np.ascontiguousarray(given, dtype=want.dtype)
 
     def _actor(self, policy: Any) -> Any:

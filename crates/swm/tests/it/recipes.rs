@@ -353,6 +353,35 @@ fn recipe_notices_outputs_that_were_replaced() {
 }
 
 #[test]
+fn steps_of_a_recipe_know_what_they_read_from_outside() {
+    let swm = Swm::new();
+    let collect = |episodes: &str, more: &[&str]| {
+        let args = ["swm/TwoRoom-v1", "-o", "mine.lance", "--policy", "explore", "--episodes", episodes];
+        swm.json(&[&["collect"], &args[..], &["--image", "32", "--max-steps", "20"], more].concat());
+    };
+    collect("10", &[]);
+    let settings = ["schedule.steps=2", "schedule.warmup=0", "data.batch_size=8", "model.image=32"];
+    let preset = swm.run(&[&["train", "lewm", "--data", "mine.lance", "--print-config"], &settings[..]].concat());
+    write(&swm, "own.toml", &text(&preset.stdout));
+    let step = "[[train]]\nname = \"small\"\nmodel = \"lewm\"\npreset = \"own.toml\"\ndata = \"mine.lance\"\n";
+    let played = "[[eval]]\nname = \"played\"\npolicies = [\"expert\"]\nenv = \"swm/TwoRoom-v1\"\ndataset = \"mine.lance\"\nepisodes = 2\n\
+                  budget = 5\ngoal-offset = 5\nno-pixels = true\n";
+    write(&swm, "outside.toml", &format!("summary = \"s\"\n{step}{played}"));
+    let args = ["train", "--recipe", "outside.toml", "-o", "run", "--trust"];
+    let first = swm.json(&args)["hashes"].clone();
+    assert_eq!(swm.json(&args)["hashes"], first);
+    write(&swm, "own.toml", &text(&preset.stdout).replace("batch_size = 8", "batch_size = 4"));
+    swm.fails(&args, 1, &["run/small", "the preset 'own.toml', which has changed"]);
+    write(&swm, "own.toml", &text(&preset.stdout));
+    swm.json(&args);
+    collect("12", &["--resume"]);
+    swm.fails(&args, 1, &["run/small", "the dataset 'mine.lance', which has changed"]);
+    // What was made needs it no more.
+    fs::rename(swm.path("mine.lance"), swm.path("moved.lance")).expect("moving the dataset");
+    assert_eq!(swm.json(&args)["hashes"], first);
+}
+
+#[test]
 fn results_of_an_evaluation_are_those_that_the_recipe_made() {
     let swm = Swm::new();
     let step = |name: &str, seed: u64| {

@@ -151,10 +151,17 @@ fn record_of_a_run_chooses_no_recipe_and_no_weights() {
     resume(&train, 1, &["no command line of a training"]);
     let train = ["swm", "train", "sac", "--env", "evil_mod:Cart-v0", "-o", "run"];
     resume(&train, 2, &["'evil_mod:Cart-v0'", "imports a Python module"]);
-    let train = ["swm", "train", "inverse", "--data", "rooms", "--encoder", "s3://bucket/run", "-o", "run"];
+    let train = ["swm", "train", "pldm", "--data", "s3://bucket/run", "-o", "run"];
     resume(&train, 2, &["s3://bucket/run", "opens a connection"]);
     let train = ["swm", "train", "dino_wm", "--data", "rooms", "-o", "run", "model.weights=nobody/nothing"];
     resume(&train, 2, &["nobody/nothing", "may be downloaded"]);
+    // Such a run is not continued at all.
+    let train = ["swm", "train", "inverse", "--data", "rooms", "--encoder", "s3://bucket/run", "-o", "run"];
+    let record = fs::read_to_string(swm.path("run/run.json")).expect("the record");
+    let mut record: Value = serde_json::from_str(&record).expect("JSON");
+    record["commands"][0]["command"] = json!(train);
+    fs::write(swm.path("run/run.json"), record.to_string()).expect("a record");
+    swm.fails(&["train", "--output", "./run", "--resume"], 2, &["cannot be resumed"]);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 mod datasets;
 mod file;
 pub(super) mod lines;
+mod outside;
 mod references;
 mod run;
 mod text_check;

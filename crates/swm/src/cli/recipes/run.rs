@@ -2,7 +2,7 @@
 
 use super::datasets::{self, Found};
 use super::file::{self, Kind, Recipe, Step, parse};
-use super::{references, text};
+use super::{outside, references, text};
 use crate::capsule;
 use crate::cli::collect::{self, CollectArgs};
 use crate::cli::eval::{self, EvalArgs};
@@ -53,6 +53,9 @@ struct State {
     /// For each finished step, the hash of those of the datasets and weights before it; older runs have none.
     #[serde(default)]
     inputs: BTreeMap<String, String>,
+    /// For each finished step, the hashes of what it read from outside the recipe; older runs have none.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    outside: BTreeMap<String, outside::Hashes>,
 }
 
 /// The comparison of a hash with the one in the recipe.
@@ -86,7 +89,9 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
             continue;
         }
         eprint(&format!("{}/{count} {}: {}\n", index + 1, kind.name(), step.name));
+        let read = outside::of(&recipe, (kind, step), request.output);
         let hash = run_step(&recipe, kind, step, request.output, context)?;
+        state.outside.extend((!read.is_empty()).then(|| (step.name.clone(), read)));
         state.inputs.insert(step.name.clone(), state.inputs_of(&recipe, step)?);
         state.finished.insert(step.name.clone(), hash);
         state.write(request.output)?;
@@ -380,8 +385,7 @@ impl State {
             request: recipe.request_hash()?,
             settings: request.settings.iter().map(ToString::to_string).collect(),
             processor: capsule::cpu_level(),
-            finished: BTreeMap::new(),
-            inputs: BTreeMap::new(),
+            ..Self::default()
         };
         if !path.exists() {
             return Ok(new);
@@ -394,7 +398,7 @@ impl State {
             let problem = format!("it holds a run of the recipe {} with other settings or steps", found.recipe);
             return Err(Error::config(request.output.display().to_string(), problem, fix));
         }
-        Ok(Self { finished: found.finished, inputs: found.inputs, ..new })
+        Ok(Self { finished: found.finished, inputs: found.inputs, outside: found.outside, ..new })
     }
 
     fn write(&self, folder: &Path) -> Result<()> {
@@ -419,6 +423,12 @@ impl State {
                 if made_from.is_some_and(|inputs| *inputs != found) {
                     let problem = "was made from other outputs of earlier steps than those that are there";
                     return Err(Error::corrupt(&output, problem, "move it away, to make it again"));
+                }
+                let read = outside::of(recipe, (kind, step), folder);
+                if let Some(what) = self.outside.get(&step.name).and_then(|recorded| outside::changed(recorded, &read))
+                {
+                    let fix = "restore that, or move this away, to make it again";
+                    return Err(Error::corrupt(&output, format!("was made with {what}, which has changed since"), fix));
                 }
                 Ok(true)
             }

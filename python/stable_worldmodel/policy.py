@@ -21,6 +21,7 @@ from . import _engine, _options
 from ._action_spaces import single
 from ._overrides import engine_part, is_overridden
 from .buffer import HistoryBuffer
+from .data import _tensors
 from .data.normalization import ZScoreScaler
 from .planning.adapter import has_torch, prepared
 from .planning.solver.engine import ACTION_SCALER, PLANS, EngineSolver, NotConfigured
@@ -564,7 +565,9 @@ class MPCPolicy(BasePolicy):
         if not isinstance(outcome, Mapping) or "actions" not in outcome:
             raise TypeError(f"{type(self.solver).__name__}.solve: expected a dict with 'actions', got {outcome!r:.200}")
         plan = outcome["actions"]
-        plan = plan.detach().cpu().numpy() if hasattr(plan, "detach") else np.asarray(plan)
+        if np.ma.is_masked(plan):
+            raise ValueError(f"{type(self.solver).__name__}.solve: expected actions without masked values, got {plan}")
+        plan = _tensors.to_numpy(plan)
         if plan.ndim != 3 or plan.shape[0] != len(due) or plan.shape[1] < self.cfg.receding_horizon:
             raise ValueError(
                 f"{type(self.solver).__name__}.solve: got actions of shape {plan.shape}, expected "
@@ -578,7 +581,8 @@ class MPCPolicy(BasePolicy):
             raise ValueError(f"{type(self.solver).__name__}.solve: expected finite actions, got a plan with NaN or infinity")
         space = single(self.env.action_space, self.env.num_envs)
         for row, i in enumerate(due):
-            self._rest[i] = plan[row, self.cfg.receding_horizon :]
+            # The solver may write its next plan over this one.
+            self._rest[i] = plan[row, self.cfg.receding_horizon :].copy()
             if not len(self._rest[i]):
                 del self._rest[i]
             steps = plan[row, : self.cfg.receding_horizon].reshape(self.cfg.receding_horizon * self.cfg.action_block, -1)

@@ -68,8 +68,8 @@ class _Factor:
 
     @property
     def init_value(self) -> Any:
-        """The default value."""
-        return self._init_value
+        """A copy of the default value."""
+        return _copied(self._init_value)
 
     @property
     def value(self) -> Any:

@@ -422,6 +422,14 @@ def test_scalers_normalise_and_invert(tmp_path):
         scaler = data.get_scaler(method).fit(action)
         inner = np.median(finite, axis=0, keepdims=True)
         np.testing.assert_allclose(scaler.inverse_transform(scaler.transform(inner)), inner, rtol=1e-5, atol=1e-6)
+    for wide in (np.int8([[-120], [120]]), np.int32([[-(2**31)], [2**31 - 1]]), np.float16([[-6e4], [6e4]])):
+        scaler, true = data.PercentileScaler(10, 90).fit(wide), np.percentile(wide.astype(np.float64), [10, 90])
+        np.testing.assert_allclose([scaler.q_low.item(), scaler.q_high.item()], true, rtol=1e-6)
+    for scaler in (data.PercentileScaler(), data.ZScoreScaler()):
+        with pytest.raises(ValueError, match="the values have masked ones"):
+            scaler.fit(np.ma.array([[1.0], [1e9]], mask=[[False], [True]]))
+        with pytest.raises(ValueError, match="expected real numbers, got complex128"):
+            scaler.fit(np.array([[1j]]))
     clipped = data.PercentileScaler(10, 90).fit_transform(finite)
     assert clipped.min() == -1 and clipped.max() == 1
     with pytest.raises(ValueError, match="not fitted"):

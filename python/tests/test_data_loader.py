@@ -187,6 +187,11 @@ def test_transform_of_a_dataset_gets_every_sample(tmp_path, suffix, backend):
     )
     both = data.ConcatDataset([b, a])
     merged = data.MergeDataset([plain, a], [["pixels"], ["state", "action", "reward"]])
+    part = data.MergeDataset(
+        [plain, data.load_dataset(tmp_path / f"a.{suffix}", transform=dict, **clip)], [["pixels"], ["state"]]
+    )
+    with pytest.warns(UserWarning, match="the transform of dataset 1 gets the columns state, without .*action"):
+        data.Loader(part, batch_size=1)
     nested = data.ConcatDataset([merged, merged])
     for dataset in (a, both, merged, nested):
         batches = list(data.Loader(dataset, 4, shuffle=False, backend=backend))

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -798,3 +799,28 @@ def test_hdf5_file_whose_creation_was_killed_is_written_again(tmp_path):
     path.write_bytes(bytes(8) + path.read_bytes()[8:])
     write(path, (6,))
     assert data.load_dataset(path).lengths.tolist() == [6]
+
+
+class Reused:
+    """A reader that fills one buffer again and again, as a decoder may."""
+
+    lengths = np.full(6, 8)
+
+    def __init__(self):
+        self.buffers = {name: np.zeros((8, 1), np.float32) for name in ("x", "y", "action")}
+
+    def load_episode(self, index):
+        for buffer in self.buffers.values():
+            buffer[:] = index
+            # Another thread may run.
+            time.sleep(0.001)
+        return self.buffers
+
+
+@pytest.mark.parametrize("threads", [0, 1, 4])
+def test_readers_may_reuse_their_buffers(threads):
+    reader = Reused()
+    loaders = [data.Loader(reader, batch_size=8, threads=threads, seed=seed, columns=["x", "y", "action"]) for seed in (0, 1)]
+    for batches in zip(*loaders, strict=True):
+        for batch in batches:
+            assert np.array_equal(batch["x"], batch["y"]) and np.array_equal(batch["x"], batch["action"])

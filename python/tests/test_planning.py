@@ -1084,6 +1084,49 @@ def test_plans_of_whole_numbers_with_many_options_are_rounded():
     assert policy.get_action({"x": np.zeros((1, 1, 1), np.float32)}).tolist() == [[3, 2**21]]
 
 
+def test_warm_starts_are_those_of_the_environment_though_a_solver_reuses_its_plans():
+    class Reusing:
+        plans, starts = np.zeros((2, 2, 2), np.float32), []
+
+        def configure(self, **given):
+            pass
+
+        def solve(self, infos, init_action=None):
+            count = len(infos["x"])
+            if init_action is not None:
+                self.starts.append(np.asarray(init_action)[:, 0, 0].tolist())
+            self.plans[:count] = np.asarray(infos["x"])[:, :, :1]
+            return {"actions": self.plans[:count]}
+
+    class Two:
+        action_space, num_envs = gymnasium.spaces.Box(-9, 9, (2, 2), np.float32), 2
+
+    solver = Reusing()
+    policy = swm.policy.MPCPolicy(solver, swm.PlanConfig(2, 1))
+    policy.set_env(Two())
+    x = np.float32([[[3.0]], [[5.0]]])
+    policy.get_action({"x": x})
+    # The second environment alone, then both.
+    policy.get_action({"x": x, "_active": np.array([False, True])})
+    policy.get_action({"x": x})
+    assert solver.starts == [[5.0], [3.0, 5.0]]
+
+
+def test_masked_plans_and_costs_are_refused():
+    class Masked:
+        def get_cost(self, infos, candidates):
+            return np.ma.array(np.zeros(candidates.shape[:2]), mask=True)
+
+    box = gymnasium.spaces.Box(-1, 1, (1, 2), np.float32)
+    solver = solvers.CEMSolver(Masked(), num_samples=4, n_steps=2, topk=2)
+    solver.configure(action_space=box, n_envs=1, config=swm.PlanConfig(1, 1))
+    infos = {"x": np.zeros((1, 1, 1), np.float32)}
+    with pytest.raises(ValueError, match="expected real numbers without masked values"):
+        solver.solve(infos, init_action=np.ma.array(np.zeros((1, 1, 2)), mask=True))
+    with pytest.raises(ValueError, match="expected real numbers without masked values, got complex"):
+        solver.solve(infos, init_action=np.full((1, 1, 2), 1j))
+
+
 def test_complex_plans_are_refused():
     class Phases:
         def configure(self, **given):

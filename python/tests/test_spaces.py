@@ -41,6 +41,7 @@ def test_changes_of_a_value_in_place_do_not_change_the_default():
     color = swm_spaces.RGBBox(init_value=given)
     for _ in range(2):
         color.value[:] = 7
+        color.init_value[:] = 8
         given[:] = 3
         assert color.init_value.tolist() == [9, 9, 9]
         color.reset()

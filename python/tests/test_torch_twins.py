@@ -169,6 +169,13 @@ def test_saving_replaces_nothing_unasked_and_refuses_other_weights(rooms, tmp_pa
     with pytest.raises(ValueError, match="none of this program"):
         module.save_pretrained(tmp_path / "foreign", overwrite=True)
     assert foreign.read_text() == '{"model_type": "bert"}' and list(foreign.parent.iterdir()) == [foreign]
+    # It would be read in place of the checkpoint.
+    own = tmp_path / "own/config.json"
+    own.parent.mkdir()
+    own.write_text('{"a": 1}')
+    with pytest.raises(ValueError, match="own: holds a config.json"):
+        module.save_pretrained(own.parent, overwrite=True)
+    assert list(own.parent.iterdir()) == [own]
     for path in ("s3://bucket/model", ""):
         with pytest.raises(ValueError, match="a local folder"):
             module.save_pretrained(path)

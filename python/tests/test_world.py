@@ -612,6 +612,8 @@ def test_indices_of_no_environment_are_refused(index):
         (lambda: rooms().collect("x", episodes=1, policy=Zero(), codec="gif"), ValueError, "jpeg-QUALITY"),
         (lambda: rooms().evaluate(policy=Zero(), episodes=0), ValueError, "at least 1"),
         (lambda: rooms().evaluate(policy=Zero(), videos=1), ValueError, "videos: no folder is named; pass video"),
+        (lambda: rooms().evaluate(policy=Zero(), video="v", videos=1.9), ValueError, "videos: 1.9; expected a whole number"),
+        (lambda: rooms().evaluate(policy=Zero(), video="v", videos=-1), ValueError, "videos: -1; expected a whole number"),
         (
             lambda: rooms(add_pixels=False).collect("x", 1, policy=Zero(), goal=True),
             ValueError,

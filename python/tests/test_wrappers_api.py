@@ -231,7 +231,13 @@ def test_infos_of_pools_are_those_of_the_episode():
     assert infos["hit"].ravel().tolist() == [False, True] and pool.seeds.tolist() == [-1, 6]
     pool.reset()
     assert pool.seeds.tolist() == [-1, -1]
-    for wrong in ([True, False, True], [True], [2, 0], [[True, True]]):
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16))
+    world.reset(seed=0)
+    for wrong in ([True, False, True], [True], [2, 0], [[True, True]], ["True", "False"], [0.2, 0]):
+        with pytest.raises(ValueError, match="mask: expected 2 values, true or false"):
+            world.envs.step(np.zeros((2, 2)), mask=wrong)
+        with pytest.raises(ValueError, match="mask: expected 2 values, true or false"):
+            world.envs.reset(mask=wrong)
         with pytest.raises(ValueError, match="mask: expected 2 values, true or false"):
             pool.step([0, 0], mask=wrong)
         with pytest.raises(ValueError, match="mask: expected 2 values, true or false"):
@@ -365,3 +371,38 @@ def test_polar_quantizer():
         inside = [x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)]
         assert grid.quantize(inside).tolist() == cell
     assert grid.quantize([9.0, 0.0]).tolist() == [3, 0]
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ((1, 0.5), [1.0, 0.5]),
+        ((0.5, 1), [0.5, 1.0]),
+        ((1, "a"), [[1], ["a"]]),
+        ((3.5, None), [[3.5], [None]]),
+        ((True, 2), [1, 2]),
+    ],
+)
+def test_infos_of_different_types_do_not_depend_on_the_order_of_environments(values, expected):
+    def envs(given):
+        made = [Changing() for _ in given]
+        for env, value in zip(made, given, strict=True):
+            env.reset = lambda value=value, **_: (np.zeros(1, np.float32), {"x": value})
+        return [lambda env=env: env for env in made]
+
+    found = EnvPool(envs(values)).reset()[1]["x"]
+    assert (found if isinstance(found, list) else found.ravel().tolist()) == expected
+    found = EnvPool(envs(values[::-1])).reset()[1]["x"]
+    assert (found if isinstance(found, list) else found.ravel().tolist()) == expected[::-1]
+
+
+def test_infos_that_their_common_type_cannot_hold_are_refused():
+    pool = EnvPool([lambda: Changing(small=-1, count=np.uint64(2**64 - 1))])
+    pool.reset()
+    with pytest.raises(ValueError, match="stored as"):
+        pool.step([np.zeros(1)])
+    pool = EnvPool([lambda: Changing(count=-1)])
+    pool.reset()
+    pool._infos["count"] = pool._infos["count"].astype(np.uint64)
+    with pytest.raises(ValueError, match="-1 is stored as uint64, which cannot hold it"):
+        pool.step([np.zeros(1)])

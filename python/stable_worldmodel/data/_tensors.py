@@ -178,6 +178,8 @@ def exact(what: str, array: Array, dtype: str) -> Array:
             wrong = converted.astype(array.dtype) != array
         if converted.dtype.kind == "i" and array.dtype.kind == "u":
             wrong |= converted < 0
+        if converted.dtype.kind == "u" and array.dtype.kind == "i":
+            wrong |= array < 0
     else:
         wrong = np.isfinite(array) & ~np.isfinite(converted)
     if wrong.any():

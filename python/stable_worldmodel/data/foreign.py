@@ -25,6 +25,9 @@ __all__ = ["check_distinct", "check_overrides", "engine_of", "left_out", "note_l
 #: The number of cached slices: a conversion reads the columns of an episode one after another.
 _CACHED = 4
 
+#: Readers of the user are called one at a time, because threads of the engine call them, and several may share a buffer.
+_READING = fork_lock()
+
 #: Where readers note the names of texts and values of episodes, which the engine does not get.
 _LEFT_OUT: ContextVar[set[str] | None] = ContextVar("left_out", default=None)
 
@@ -92,14 +95,17 @@ class _Rows:
             if key in self._cache:
                 return self._cache[key]
         content: dict[str, Any] = {}
-        if hasattr(self._reader, "_load_slice"):
-            found = self._reader._load_slice(episode, start, end)
-        else:
-            content = dict(self._reader.load_episode(episode).items())
-            whole = (str, bytes, Mapping)
-            found = {name: value if isinstance(value, whole) else value[start:end] for name, value in content.items()}
-        # A slice has one action for each row, also for the last row of an episode.
-        arrays, constants = _tensors.rows(found)
+        with _READING:
+            if hasattr(self._reader, "_load_slice"):
+                found = self._reader._load_slice(episode, start, end)
+            else:
+                content = dict(self._reader.load_episode(episode).items())
+                whole = (str, bytes, Mapping)
+                found = {name: value if isinstance(value, whole) else value[start:end] for name, value in content.items()}
+            # A slice has one action for each row, also for the last row of an episode.
+            arrays, constants = _tensors.rows(found)
+            # The reader may fill its buffer with the next episode.
+            arrays = {name: array.copy() for name, array in arrays.items()}
         self._check_rows(episode, content, [name for name in arrays if name in content])
         if self._left_out is not None:
             self._left_out.update(constants)

@@ -7,6 +7,7 @@ import json
 import math
 import operator
 import os
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -174,6 +175,8 @@ class Loader:
         check_overrides("Loader", dataset, "use torch's DataLoader, or the dataset's transform")
         #: Whether the dataset, or one that it joins, has a transform of samples.
         self._has_own = bool(transforms_of(self._content))
+        if isinstance(dataset, MergeDataset):
+            _warn_of_transforms(dataset)
         self.batch_size = _options.whole("batch_size", batch_size)
         self.seed = _options.whole("seed", seed)
         if cache is None:
@@ -415,3 +418,15 @@ def _ahead(batches: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         while (batch := following.result()) is not None:
             following = thread.submit(next, batches, None)
             yield batch
+
+
+def _warn_of_transforms(dataset: MergeDataset) -> None:
+    """Warns of transforms of parts that get fewer columns than in `dataset[i]`: those of the merged dataset."""
+    for index, (part, keys) in enumerate(zip(dataset.datasets, dataset.keys_map, strict=True)):
+        left_out = [name for name in getattr(part, "column_names", None) or [] if name not in keys]
+        if left_out and transforms_of(part):
+            warnings.warn(
+                f"Loader: the transform of dataset {index} gets the columns {', '.join(keys) or 'none'}, without "
+                f"{', '.join(left_out)}, which dataset[i] gives it; take them from that dataset, or use torch's DataLoader",
+                stacklevel=3,
+            )

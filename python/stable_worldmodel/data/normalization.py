@@ -50,9 +50,13 @@ def _finite_rows(values: Any) -> Array:
     """The rows `(n, d)` without NaN. The missing action of an episode's last row is NaN.
 
     Raises:
-        ValueError: If there is no such row, or a number is infinite.
+        ValueError: If there is no such row, or a number is infinite, complex or masked.
     """
+    if np.ma.is_masked(values):
+        raise ValueError("fit: the values have masked ones; leave them out, with `compressed`, or fill them with `filled`")
     array = _tensors.to_numpy(values)
+    if array.dtype.kind == "c":
+        raise ValueError(f"fit: expected real numbers, got {array.dtype}")
     array = array.astype(np.float64) if array.dtype == bool else array
     array = array.reshape(-1, array.shape[-1] if array.ndim > 1 else 1)
     array = array[~np.isnan(array).any(axis=1)]
@@ -154,7 +158,9 @@ class PercentileScaler(_Affine):
     def fit(self, X: Any) -> PercentileScaler:
         """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
         rows = _finite_rows(X)
-        self.q_low, self.q_high = np.percentile(rows, [self.low, self.high], axis=0).astype(
+        # Differences of neighbours may be beyond integers and half precision.
+        wide = rows if rows.dtype == np.float32 else rows.astype(np.float64)
+        self.q_low, self.q_high = np.percentile(wide, [self.low, self.high], axis=0).astype(
             np.result_type(rows.dtype, np.float32)
         )
         return self

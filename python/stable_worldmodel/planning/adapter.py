@@ -183,7 +183,7 @@ class Adapter:
         """The costs `(B, S)` of candidates `(B, S, H, A)`."""
         if not self.torch:
             # A model may write the costs of the next environments over these.
-            costs = np.concatenate([np.array(self.model.get_cost(*part)) for part in self._parts(candidates, "cost")])
+            costs = np.concatenate([self._own_costs(*part) for part in self._parts(candidates, "cost")])
             self._check_real(costs)
             return np.ascontiguousarray(costs, dtype=np.float32)
         if not _torch().is_inference_mode_enabled():
@@ -195,6 +195,12 @@ class Adapter:
                 return self._numpy([self._cost(*parts[0])])
             # A model may write the costs of the next environments over these, so each is copied before the next.
             return np.concatenate([self._numpy([self._cost(infos, part)]).copy() for infos, part in parts])
+
+    def _own_costs(self, infos: dict[str, Any], candidates: Any) -> np.ndarray:
+        costs = self.model.get_cost(infos, candidates)
+        if np.ma.is_masked(costs):
+            raise CostError(f"{type(self.model).__name__}.get_cost: expected costs without masked values, got {costs}")
+        return np.array(costs)
 
     def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The costs `(B, S)` of candidates `(B, S, H, A)` and their gradients `(B, S, H, A)`."""

@@ -97,7 +97,11 @@ class Pretrained(nn.Module):
                 f"{type(self).__name__}.save_pretrained: the module has no configuration of the engine; load it with "
                 "from_pretrained, or create it with stable_worldmodel.train.Trainer"
             )
-        return write(run_path(path), self.stored, self.checkpoint_weights(), replace=overwrite)
+        run = run_path(path)
+        if overwrite and (run / "config.json").exists():
+            # It would be read in place of the checkpoint, which is in a folder of its own.
+            raise ValueError(f"{run}: holds a config.json; give the folder of a run, or another folder")
+        return write(run, self.stored, self.checkpoint_weights(), replace=overwrite)
 
     def checkpoint_weights(self) -> dict[str, Tensor]:
         """The weights under the names of a checkpoint of the engine."""

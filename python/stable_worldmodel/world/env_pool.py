@@ -17,7 +17,7 @@ from ..data import _tensors
 if TYPE_CHECKING:
     from .world import World
 
-__all__ = ["EnvPool", "WorldEnvs"]
+__all__ = ["EnvPool", "WorldEnvs", "chosen"]
 
 #: An entry that the info of an environment lacks.
 _MISSING: Any = object()
@@ -121,7 +121,7 @@ class EnvPool:
         if len(started) == count:
             infos = [started[env] for env in range(count)]
             keys = dict.fromkeys(key for info in infos for key in info)
-            self._infos = {key: _column([info.get(key, _MISSING) for info in infos]) for key in keys}
+            self._infos = {key: _column(key, [info.get(key, _MISSING) for info in infos]) for key in keys}
         elif self._infos is None:
             raise ValueError("mask: the first reset must be one of all environments")
         else:
@@ -167,12 +167,7 @@ class EnvPool:
 
     def _chosen(self, mask: Any) -> list[int]:
         """The environments that a mask chooses."""
-        if mask is None:
-            return list(range(self.num_envs))
-        chosen = _tensors.to_numpy(mask)
-        if chosen.shape != (self.num_envs,) or not np.isin(chosen, (False, True)).all():
-            raise ValueError(f"mask: expected {self.num_envs} values, true or false, one for each environment, got {mask!r}")
-        return np.flatnonzero(chosen).tolist()
+        return np.flatnonzero(chosen(mask, self.num_envs)).tolist()
 
     def _clear(self, env: int, keys: Iterable[str]) -> None:
         """Sets entries of an environment to what they are before their first value."""
@@ -208,6 +203,18 @@ class EnvPool:
                 column[env, 0] = torch.as_tensor(array, dtype=column.dtype, device=column.device)
             else:
                 column[env, 0] = array
+
+
+def chosen(mask: Any, count: int) -> np.ndarray:
+    """Whether a mask chooses each of `count` environments; `None` chooses all.
+
+    Raises:
+        ValueError: If it has other values than true and false, or another number of them.
+    """
+    given = np.ones(count, bool) if mask is None else _tensors.to_numpy(mask)
+    if given.shape != (count,) or given.dtype.kind not in "biuf" or not np.isin(given, (0, 1)).all():
+        raise ValueError(f"mask: expected {count} values, true or false, one for each environment, got {mask!r}")
+    return given.astype(bool)
 
 
 def _is_batch(space: spaces.Space[Any], actions: Any, count: int) -> bool:
@@ -254,16 +261,33 @@ def _flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def _column(values: list[Any]) -> Any:
-    """The values of the environments as an array or tensor `(num_envs, 1, ..)`, or as a list."""
-    first = next(value for value in values if value is not _MISSING)
+def _column(key: str, values: list[Any]) -> Any:
+    """The values of the environments as an array or tensor `(num_envs, 1, ..)`, or as a list.
+
+    Raises:
+        ValueError: If the values differ in shape, or their common type cannot hold one.
+    """
+    present = [value for value in values if value is not _MISSING]
+    first = present[0]
     if hasattr(first, "detach"):
         import torch
 
         return torch.stack([torch.zeros_like(first) if value is _MISSING else value for value in values]).unsqueeze(1)
-    if isinstance(first, (np.ndarray, np.number, np.bool_, bool, int, float)):
-        return np.stack([np.zeros_like(first) if value is _MISSING else np.asarray(value) for value in values])[:, None]
-    return [[None if value is _MISSING else value] for value in values]
+    kinds = (np.ndarray, np.number, np.bool_, bool, int, float)
+    arrays = [np.asarray(value) for value in present if isinstance(value, kinds)]
+    found = {array.dtype.kind for array in arrays}
+    if len(arrays) < len(present) or not (found <= set("biuf") or found in ({"U"}, {"S"})):
+        return [[None if value is _MISSING else value] for value in values]
+    if any(array.shape != arrays[0].shape for array in arrays):
+        shapes = ", ".join(str(array.shape) for array in arrays)
+        raise ValueError(f"info[{key!r}]: the environments have values of the shapes {shapes}; expected equal ones")
+    dtype = np.result_type(*arrays).name
+    zero = np.zeros(arrays[0].shape, dtype)
+    stored = [zero if value is _MISSING else np.asarray(value) for value in values]
+    if not found <= set("biuf"):
+        return np.stack(stored)[:, None]
+    exact = [_tensors.exact(f"info[{key!r}]", value.reshape(-1), dtype).reshape(zero.shape) for value in stored]
+    return np.stack(exact)[:, None]
 
 
 class WorldEnvs(EnvPool):
@@ -319,7 +343,7 @@ class WorldEnvs(EnvPool):
         mask: Sequence[bool] | np.ndarray | None = None,
     ) -> tuple[None, dict[str, Any]]:
         """As `World.reset`, which starts an episode in every environment."""
-        if mask is not None and not all(mask):
+        if not chosen(mask, self.num_envs).all():
             raise ValueError("mask: the environments of a World are reset together; World.step resets finished ones")
         self._world.reset(seed, options)  # type: ignore[arg-type]
         return None, self._world.infos

@@ -22,8 +22,9 @@ from .. import _engine, _files, _gym, _options, _progress
 from .. import spaces as swm_spaces
 from .._lazy import lazy
 from .._overrides import is_overridden
+from ..data import _tensors
 from ..wrapper.visual import engine_wrappers
-from .env_pool import WorldEnvs
+from .env_pool import WorldEnvs, chosen
 from .experts import check_experts
 from .metrics import Metrics
 from .records import (
@@ -442,7 +443,7 @@ class World:
     def _step_with(self, actions: Any, mask: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Steps the environments of `mask` whose episode goes on; returns rewards, terminated and truncated."""
         active = ~(self.terminateds | self.truncateds)
-        active &= True if mask is None else np.asarray(mask, bool)
+        active &= chosen(mask, self.num_envs)
         self._actions[active] = self._engine_form("actions", actions, active)[active]
         self._fresh[active] = False
         self._world.advance(active.tolist())
@@ -531,7 +532,7 @@ class World:
         """
         if np.ma.is_masked(given):
             raise ValueError(f"{what}: expected actions without masked values, got {given}")
-        given = given.detach().cpu().numpy() if hasattr(given, "detach") else np.asarray(given)
+        given = _tensors.to_numpy(given)
         want = self._actions
         if given.size != want.size or given.shape[:1] != want.shape[:1]:
             expected = self.envs.action_space.shape
@@ -828,6 +829,7 @@ class World:
             raise ValueError("episodes_idx, start_steps, goal_offset: they select rows of a dataset; pass dataset=…")
         if videos is not None and video is None:
             raise ValueError("videos: no folder is named; pass video=… as well")
+        videos = None if videos is None else _options.count("videos", videos, 0)
         episodes = 50 if episodes is None else _options.count("episodes", episodes)
         hold = _options.count("hold", hold)
         if hold != 1 and protocol == "compat":
@@ -860,7 +862,7 @@ class World:
                 if video is not None and not runs:
                     folder = _files.local("video", video)
                     folder.mkdir(parents=True, exist_ok=True)
-                    recording = [str(folder), "episode", episodes if videos is None else int(videos)]
+                    recording = [str(folder), "episode", episodes if videos is None else videos]
                 given = _options.as_json("World.evaluate", {**config, "policy": name, "videos": recording})
                 with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
                     runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))

@@ -17,6 +17,7 @@ from ... import _engine, _options
 from ..._action_spaces import single
 from ..._forks import fork_lock
 from ..._overrides import engine_part
+from ...data import _tensors
 from ..adapter import Adapter
 from .callbacks import Callback
 from .hooks import Observer, Watched, view
@@ -386,7 +387,10 @@ def _scaled(scaler: Any, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _padded(init: Any, envs: int, horizon: int, dim: int) -> np.ndarray:
     """The initial actions, padded with zeros to `(envs, horizon, dim)`."""
-    init = np.asarray(init.detach().cpu() if hasattr(init, "detach") else init, dtype=np.float32)
+    given = _tensors.to_numpy(init)
+    if np.ma.is_masked(init) or given.dtype.kind not in "biuf":
+        raise ValueError(f"init_action: expected real numbers without masked values, got {given.dtype}")
+    init = given.astype(np.float32)
     if init.ndim != 3 or init.shape[0] != envs or init.shape[1] > horizon or init.shape[2] != dim:
         raise ValueError(f"init_action: got shape {init.shape}, expected ({envs}, at most {horizon}, {dim})")
     return np.concatenate([init, np.zeros((envs, horizon - init.shape[1], dim), np.float32)], 1)
